@@ -112,8 +112,8 @@ class LaneBEV(BoundaryDetector):
         seen, known = (_configured(part, "num_boundaries") for part in (segmenter, calibrator))
         if seen != known and None not in (seen, known):
             raise ValueError(
-                f"num_boundaries: expected the same of both, got {seen} of the segmenter and {known} of the "
-                f"calibrator; make the calibrator with num_boundaries={seen}"
+                f"num_boundaries: expected the same of segmenter and calibrator, got {seen} and {known}; "
+                f"make the calibrator with num_boundaries={seen}"
             )
         if pose_sigma_scale is None:
             pose_sigma_scale = _configured(segmenter, "pose_sigma_scale", 1.0)

@@ -70,7 +70,7 @@ def check_devices(tensors: Mapping[str, Tensor | None]) -> None:
     for name, tensor in others:
         if tensor is not None and tensor.device != like.device:
             raise ValueError(
-                f"{name}: expected on {like.device} as the {first}, got on {tensor.device}; move it there"
+                f"{name}: expected on {like.device} like the {first}, got on {tensor.device}; move it there"
             )
 
 

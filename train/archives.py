@@ -45,5 +45,5 @@ def decode_jpeg(jpeg: NDArray[np.uint8], ends: NDArray[np.int64], index: int) ->
     start = ends[index - 1] if index else 0
     image = cv2.imdecode(jpeg[start : ends[index]], cv2.IMREAD_COLOR_RGB)
     if image is None:
-        raise ValueError(f"frame {index}: expected a JPEG image, it does not decode")
+        raise ValueError(f"frame {index}: expected a JPEG image that decodes, got another")
     return np.asarray(image, np.uint8)

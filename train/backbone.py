@@ -23,7 +23,7 @@ def load_backbone(trunk: ResNet18, path: Path) -> None:
     """
     state = _read(path)
     if not all(bool(value.isfinite().all()) for value in state.values()):
-        raise ValueError(f"backbone: {path}: expected finite numbers, got others")
+        raise ValueError(f"backbone: {path}: expected finite numbers, got NaN or infinity")
     try:
         trunk.load_torchvision(state)
     except (RuntimeError, AttributeError) as error:

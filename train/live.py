@@ -209,7 +209,7 @@ class LiveRoads(L.LightningDataModule):
             raise ValueError(f"far_share: expected a probability of 0 to 1, got {far_share}")
         if far_share and window is None:
             raise ValueError(
-                f"far_share: expected a window with it, got {far_share} without; give window: {{}}"
+                f"far_share: expected the setting window too, got {far_share} without; give window: {{}}"
             )
         self.stages = [
             Stage(stage.until, stage.size, max(repeats, round(batch_share * stage.batch_size)))

@@ -138,7 +138,7 @@ def check_camera_of_run(result: Path, camera: Camera) -> None:
     """Raise unless a camera is that of a run, by the ``calibration.yaml`` in its folder."""
     path = result / "calibration.yaml"
     if path.is_file() and Camera.from_file(path).fingerprint() != camera.fingerprint():
-        raise ValueError(f"camera: expected that of the run, got another; {path} is the run's")
+        raise ValueError(f"camera: expected the camera of the run, {path}, got another")
 
 
 def frames_of_run(source: str, result: Path) -> Iterator[Frame]:

@@ -102,7 +102,8 @@ def _kitti(entries: Mapping[str, str], name: str, image_size: tuple[int, int] | 
     if size_name not in entries and centre_offset(matrix, size) > OFF_CENTRE:
         raise ValueError(
             f"{name}: expected a camera of the images' {size[1]} x {size[0]} px, got a principal point of "
-            f"{matrix[2]:g}, {matrix[5]:g}; give the images as they came, or add 'S_rect_02: WIDTH HEIGHT'"
+            f"{matrix[2]:g}, {matrix[5]:g}; give the images in their original size, or add "
+            "'S_rect_02: WIDTH HEIGHT'"
         )
     return CameraParameters(matrix, [], "pinhole", size)
 
@@ -138,8 +139,8 @@ def colmap_text(path: Path) -> str:
         lines = []
     if place < len(data) or not lines:
         raise ValueError(
-            "no whole cameras.bin of COLMAP, or one of further models; COLMAP writes texts by "
-            "model_converter --output_type TXT"
+            "a cameras.bin of COLMAP that is cut, or has a camera model that is not known here; convert it "
+            "by colmap model_converter --output_type TXT"
         )
     return "\n".join(lines)
 

@@ -191,7 +191,7 @@ def _camera(
     if cameras := _unordered_cameras(content, image_size, rectified):
         return checked(chosen(cameras, name, has_usual=False))
     if isinstance(content, list):
-        raise ValueError("camera_intrinsic: expected that of a camera, got none")
+        raise ValueError("camera_intrinsic: expected a camera with this key, got none")
     content = as_kalibr(content)
     if cameras := _ordered_cameras(content, image_size, rectified):
         return checked(chosen(cameras, name, has_usual=True))

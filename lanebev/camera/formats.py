@@ -158,7 +158,7 @@ def _spelled_once(fields: Mapping[str, Any]) -> dict[str, Any]:
     for key in fields:
         if (first := known.setdefault(spelled(key), key)) != key:
             raise ValueError(
-                f"expected one of {first} and {key}, which are read alike, got both; rename one, or leave it "
+                f"expected one of {first} and {key}, which mean the same, got both; rename one, or leave it "
                 "out"
             )
     return {name: fields[key] for name, key in known.items()}
@@ -204,7 +204,7 @@ def _of_images(fields: Mapping[str, Any], rectified: bool, image_size: tuple[int
     camera = opencv_or_ros({**fields, "width": width, "height": height}, rectified)
     if centre_offset(camera.matrix, image_size) > _OFF_CENTRE:
         raise ValueError(
-            f"width and height: expected those of the images that it was calibrated with, got none, and the "
+            f"width and height: expected the size of the images of the calibration, got none, and the "
             f"principal point {camera.matrix[2]:g}, {camera.matrix[5]:g} is not in the middle of "
             f"{width} x {height} px; add them"
         )
@@ -253,7 +253,7 @@ def stated_model(fields: Mapping[str, Any], usual: str = "pinhole") -> str:
     written = [str(fields[key]).strip().lower() for key in _MODEL_KEYS if fields.get(key) is not None]
     names = [_ALSO.get(name, name) for name in (re.sub(r"[\s_-]+", "_", each) for each in written)]
     if names[:1] == ["none"] and any(stated_lens(fields, _LENS_KEYS, "pinhole")):
-        raise ValueError("model: expected that of the coefficients, got none; write it, or leave them out")
+        raise ValueError("model: expected the lens model of the coefficients, got none; add the entry")
     if names and names[0] not in _MODELS:
         known = ", ".join(each for each in _MODELS if each)
         raise ValueError(f"model: expected one of {known}, got {shown(written[0])}")
@@ -307,9 +307,9 @@ def _check_full_resolution(camera: CameraParameters, binned_size: tuple[int, int
     if 2 * centre_offset(camera.matrix, binned_size) < centre_offset(camera.matrix, camera.image_size):
         rows, columns = binned_size
         raise ValueError(
-            f"camera_matrix: expected that of the full {width} x {height} px, got a principal point of "
+            f"camera_matrix: expected one for the full {width} x {height} px, got a principal point of "
             f"{camera.matrix[2]:g}, {camera.matrix[5]:g}, in the middle of the binned {columns} x {rows}; "
-            f"if it is theirs, write width {columns}, height {rows} and binning 1"
+            f"if the matrix is for these, write width {columns}, height {rows} and binning 1"
         )
 
 

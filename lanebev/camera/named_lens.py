@@ -30,7 +30,7 @@ def named_lens(fields: Mapping[str, Any], model: str) -> list[float]:
     ]
     if unfit:
         raise ValueError(
-            f"{unfit[0]}: expected none of this lens ({model}), got {given[unfit[0]]:g}; "
+            f"{unfit[0]}: expected no such coefficient of a {model} lens, got {given[unfit[0]]:g}; "
             "is model: fisheye missing, or wrong?"
         )
     coefficients = [given.get(name, 0.0) for name in names]

@@ -57,7 +57,8 @@ def size_of_images(
     if image_size and known and max(abs(image_size[0] - known[0]), abs(image_size[1] - known[1])) > spread:
         raise ValueError(
             f"expected images of about {known[1]} x {known[0]} px, {whose}, got "
-            f"{image_size[1]} x {image_size[0]}; give them as they came, or the short YAML for the resized"
+            f"{image_size[1]} x {image_size[0]}; give images in their original size, or the "
+            "short YAML for the resized ones"
         )
     return image_size or known
 

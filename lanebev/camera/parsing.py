@@ -94,9 +94,9 @@ class _TextLoader(yaml.SafeLoader):
 
     def construct_mapping(self, node: yaml.Node, deep: bool = False) -> dict[Any, Any]:
         if not isinstance(node, yaml.MappingNode):
-            raise ValueError(f"expected keys and values at line {node.start_mark.line + 1}, got others")
+            raise ValueError(f"expected keys and values at line {node.start_mark.line + 1}, got none")
         if not all(isinstance(key, yaml.ScalarNode) for key, _ in node.value):
-            raise ValueError("expected plain keys, got a list or a mapping for one")
+            raise ValueError("expected plain keys, got a list or a mapping as a key")
         once((key.value, None) for key, _ in node.value)
         return {key.value: self.construct_object(value, deep=deep) for key, value in node.value}
 

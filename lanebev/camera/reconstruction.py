@@ -62,7 +62,7 @@ def openmvg_cameras(content: Any) -> Readers:
     entries: Sequence[Any] = content.get("intrinsics") or []
     found = [mapping("intrinsics", each) for each in entries]
     if not found:
-        raise ValueError("intrinsics: expected that of a camera, got none")
+        raise ValueError("intrinsics: expected an entry for each camera, got none")
     return {str(each.get("key")): partial(_openmvg, each) for each in found}
 
 

@@ -60,7 +60,7 @@ def as_kalibr(fields: Mapping[str, Any]) -> Mapping[str, Any]:
     else:
         return fields
     if not cameras:
-        raise ValueError("resolution: expected that of each camera, got none")
+        raise ValueError("resolution: expected the image size of each camera, got none")
     return {f"cam{number}": camera for number, camera in enumerate(cameras)}
 
 
@@ -134,7 +134,7 @@ def _kalibr(fields: Mapping[str, Any]) -> CameraParameters:
     if names[1] != "none":
         distortion = numbers(fields, *coefficients, count=None if model == "pinhole" else 4)
     elif any(fields.get(key) for key in coefficients) and any(numbers(fields, *coefficients)):
-        raise ValueError("distortion_model: expected the one of distortion_coeffs, got none; add the entry")
+        raise ValueError("distortion_model: expected the lens model of distortion_coeffs, got none; add it")
     *xi, fx, fy, cx, cy = intrinsics
     size = listed_size(fields, "resolution")
     return CameraParameters(matrix_entries(fx, fy, cx, cy), [*xi, *distortion], model, size)
@@ -220,7 +220,7 @@ def _orb_slam(fields: Mapping[str, Any], of: str) -> CameraParameters:
     given = [of + key for key in names.split()]
     distortion = [number(fields, key, default=0.0) for key in given]
     if model == "pinhole" and fields.get(of + "k4") is not None and number(fields, of + "k4"):
-        raise ValueError(f"{of}k4: expected none of {kind}, got one; is Camera.type: KannalaBrandt8 missing?")
+        raise ValueError(f"{of}k4: expected no k4 of {kind}, got it; is Camera.type: KannalaBrandt8 missing?")
     size = (
         whole_number(fields, "Camera.height", "Camera.rows"),
         whole_number(fields, "Camera.width", "Camera.cols"),

@@ -58,7 +58,7 @@ def check_state(state: TensorTuple, kind: type[TensorTuple], rows: int) -> Tenso
     for name in ("status", "reasons"):
         if name in parts and parts[name].dtype != torch.int64:
             got = parts[name].dtype
-            raise ValueError(f"state.{name}: expected int64, got {got}; cast only what is floating point")
+            raise ValueError(f"state.{name}: expected int64, got {got}; cast only floating-point tensors")
     return like
 
 

@@ -35,7 +35,7 @@ def make_part(name: str, model: LaneBEV, camera: Camera) -> Part:
         raise ValueError(f"part: expected one of {', '.join(PARTS)}, got {name!r}")
     if model.far_view is not None and name == "extractor":
         raise ValueError(
-            "far view: expected another part than the extractor, which has images of one size; export the "
+            "far view: expected another part than the extractor, which takes images of one size; export the "
             "step, or a model without far view"
         )
     model = model.eval()

@@ -41,7 +41,7 @@ class OnnxPart:
         except ImportError as error:
             raise ValueError(f"onnxruntime: {MISSING} ({error})") from error
         if not path.is_file():
-            raise ValueError(f"{path}: expected a file that lanebev export writes, there is none")
+            raise ValueError(f"{path}: expected a file that lanebev export writes, found none")
         options = onnxruntime.SessionOptions()
         options.log_severity_level = 3  # errors
         try:
@@ -158,8 +158,8 @@ def onnx_model(folder: Path, camera: Camera, far_view: bool = False) -> LaneBEV:
     lines = segmenter.facts.get("lines", {})
     if far_view and not lines:
         raise ValueError(
-            f"{folder / 'segmenter.onnx'}: expected one for far views, got one for whole images; export it "
-            "again with --far-view"
+            f"{folder / 'segmenter.onnx'}: expected a segmenter for far views, got one for whole images; "
+            "export it again with --far-view"
         )
     extractor = segmenter if far_view else _part(folder, "extractor")
     expected = (list(camera.image_size), camera.model if camera.distortion.numel() else None)

@@ -48,7 +48,7 @@ def load_segmenter(path: str | Path | None = None) -> LaneSegmenter:
             segmenter = LaneSegmenter(config)
         segmenter.load_state_dict(tensors, strict=True)
         if not all(bool(value.isfinite().all()) for value in tensors.values()):
-            raise ValueError("expected finite numbers, got others; was the training unstable?")
+            raise ValueError("expected finite numbers, got NaN or infinity; was the training unstable?")
     except (LookupError, TypeError, ValueError, RuntimeError, ArithmeticError, AttributeError) as error:
         reason = " ".join(str(error).split())[:200]
         raise ValueError(f"{path}: weights do not fit the network they describe: {reason}") from error
@@ -125,7 +125,7 @@ def quantised(weight: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
 def _read(path: Path, tensors: bool = True) -> tuple[dict[str, str], dict[str, torch.Tensor]]:
     """Read metadata, and every tensor in single precision (counters unchanged)."""
     if not path.is_file():
-        raise ValueError(f"{path}: expected a weights file, there is none")
+        raise ValueError(f"{path}: expected a weights file, found none")
     if is_checkpoint(path):
         name = path.with_suffix(".safetensors").name
         raise ValueError(

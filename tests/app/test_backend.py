@@ -125,14 +125,14 @@ def test_files_of_another_camera_or_calibrator_are_refused(folder, monkeypatch):
 
 def test_a_segmenter_without_far_view_is_refused(folder, monkeypatch):
     monkeypatch.setattr(runtime, "OnnxPart", lambda path: SimpleNamespace(facts={"part": path.stem}))
-    with pytest.raises(ValueError, match=r"segmenter\.onnx: expected one for far views, got one for whole"):
+    with pytest.raises(ValueError, match=r"segmenter\.onnx: expected a segmenter for far views, got one"):
         runtime.onnx_model(folder, Camera.from_fov(60.0, 640, 360), far_view=True)
 
 
 def test_a_run_without_the_files_is_one_line(folder, capsys):
     words = ["run", "images", "--camera", "camera.yaml", "--backend", "onnxruntime", "--exported", "nowhere"]
     assert main([str(folder / word) if word in ("images", "camera.yaml") else word for word in words]) == 2
-    assert "joint.onnx: expected a file that lanebev export writes, there is none" in capsys.readouterr().err
+    assert "joint.onnx: expected a file that lanebev export writes, found none" in capsys.readouterr().err
 
 
 def test_more_segments_than_exported_are_refused():
@@ -155,10 +155,10 @@ def test_settings_are_checked():
     assert ExportConfig(camera="c", far_view=True).parts == ("segmenter", "joint", "step")
     assert ExportConfig(camera="c", part="joint", far_view=True).parts == ("joint",)
     with pytest.raises(
-        ValueError, match="part: expected segmenter, joint, two-stage or step with --far-view, got warp, of"
+        ValueError, match="part: expected segmenter, joint, two-stage or step with --far-view, got warp"
     ):
         ExportConfig(camera="c", part="warp", far_view=True)
-    with pytest.raises(ValueError, match="int8: expected no far view with it, got both"):
+    with pytest.raises(ValueError, match="int8: expected --int8 or --far-view, got both"):
         ExportConfig(camera="c", int8=True, far_view=True)
     for other in ({"format": "torch-export"}, {"part": "warp"}):
         with pytest.raises(ValueError, match="int8: expected --format onnx and the part segmenter"):
@@ -166,7 +166,7 @@ def test_settings_are_checked():
     with pytest.raises(ValueError, match="backend: expected torch or onnxruntime, got 'tvm'"):
         RunConfig(source="s", camera="c", backend="tvm")
     for name in ("weights", "device"):
-        with pytest.raises(ValueError, match=f"{name}: expected --backend torch with it, got onnxruntime"):
+        with pytest.raises(ValueError, match=f"{name}: expected --backend torch, got onnxruntime"):
             RunConfig(source="s", camera="c", backend="onnxruntime", **{name: "cuda"})
 
 

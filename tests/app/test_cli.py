@@ -115,7 +115,9 @@ def test_a_run_does_not_replace_what_it_reads(data, drive, tmp_path, capsys):
         source=data / "drive.mp4", camera=data / "camera.yaml", lanes=data / "video_lanes.json", word=""
     ):
         arguments = ["run", source, "--camera", camera, "--lanes", lanes, "--out", out]
-        fails(capsys, arguments, f"input {out / word}: expected a file that the run leaves", "another folder")
+        fails(
+            capsys, arguments, f"input {out / word}: expected a file that the run does not", "another folder"
+        )
         assert {path.name: path.read_bytes() for path in out.iterdir() if path.is_file()} == before
 
     case(source=out / "bev.mp4", word="bev.mp4")

@@ -144,7 +144,7 @@ def test_a_mount_decides_what_one_lane_leaves_open(tmp_path):
     ("values", "message"),
     [
         ({}, "camera: expected --camera FILE, or --fov DEG if no file is at hand, got none"),
-        ({"camera": "c", "fov": 60.0}, "fov: expected no --camera beside it, got both"),
+        ({"camera": "c", "fov": 60.0}, "fov: expected --camera or --fov, got both"),
         ({"fov": 180.0}, "fov: expected a horizontal field of view of 10 to 179 degrees, got 180"),
         ({"fov": np.nan}, "fov: expected a horizontal field of view"),
         ({"fov": 60.0, "focal_std": -0.1}, "focal std: expected a share of the focal length .*, got -0.1"),

@@ -70,8 +70,8 @@ def test_roads_of_the_settings(data, tmp_path):
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"calibrator": "two-stage"}, "hilly: expected --calibrator joint with it, got two-stage"),
-        ({"backend": "onnxruntime", "exported": "x"}, "hilly: expected --backend torch with it, got onnx"),
+        ({"calibrator": "two-stage"}, "hilly: expected --calibrator joint, got two-stage"),
+        ({"backend": "onnxruntime", "exported": "x"}, "hilly: expected --backend torch, got onnx"),
     ],
 )
 def test_it_needs_a_calibrator_that_knows_hills(data, tmp_path, values, message):

@@ -85,7 +85,9 @@ def test_speeds_that_do_not_fit_are_one_line(capsys, data, tmp_path):
     later.write_text("1700000000.0,5\n1700000000.1,5\n")
     fixed = ("run", data / "images", "--camera", data / "camera.yaml", "--out", tmp_path / "out")
     fails(
-        capsys, [*fixed, "--speed", wrong], f"expected one for each of {FRAMES} frames, got 2; or add a col"
+        capsys,
+        [*fixed, "--speed", wrong],
+        f"expected a speed for each of {FRAMES} frames, got 2; or add",
     )
     fails(
         capsys,
@@ -93,8 +95,8 @@ def test_speeds_that_do_not_fit_are_one_line(capsys, data, tmp_path):
         "expected times since the first frame, 0 to 0.20 s, got 1700000000",
     )
     fails(capsys, [*fixed, "--speed", tmp_path / "none.csv"], "none.csv: No such file")
-    fails(capsys, [*fixed, "--speed", wrong, "--stills"], "speed: expected a drive with it, got --stills")
-    fails(capsys, [*fixed, "--speed-topic", "/odom"], "speed topic: expected a bag with it, got ")
+    fails(capsys, [*fixed, "--speed", wrong, "--stills"], "speed: expected a drive, got --stills")
+    fails(capsys, [*fixed, "--speed-topic", "/odom"], "speed topic: expected a bag as the source, got ")
     fails(
         capsys, [*fixed, "--speed-topic", "/odom", "--speed", wrong], "expected a file or a topic, got both"
     )

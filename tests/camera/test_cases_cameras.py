@@ -368,7 +368,7 @@ def test_nuscenes_and_openlane_json(tmp_path):
 @pytest.mark.parametrize(
     ("name", "text", "message"),
     [
-        ("c.json", "[]", "camera_intrinsic: expected that of a camera, got none"),
+        ("c.json", "[]", "camera_intrinsic: expected a camera with this key"),
         ("c.json", '{"a": 1, "a": 2}', "expected each key once, got 'a' twice"),
         ("c.json", '{"image_width": 1280, "image_height"', "syntax error at line 1; is the file cut"),
         (

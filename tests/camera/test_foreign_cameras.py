@@ -88,7 +88,7 @@ def test_a_camera_may_state_that_it_has_no_lens(tmp_path, name):
     zeros = OST.replace("[0.175653, -0.031772, 0.000362, -0.000719]", "[0, 0, 0, 0]")
     camera = _read(tmp_path / "c.yaml", zeros.replace(MODEL, f"distortion_model: {name}"))
     assert (camera.model, camera.distortion.tolist()) == ("pinhole", [])
-    with pytest.raises(ValueError, match="model: expected that of the coefficients, got none; write it"):
+    with pytest.raises(ValueError, match="model: expected the lens model of the coefficients, got none"):
         _read(tmp_path / "c.yaml", OST.replace(MODEL, f"distortion_model: {name}"))
 
 
@@ -225,7 +225,7 @@ def test_colmaps_pixels_begin_at_their_corner(tmp_path, line, expected):  # colm
     data = struct.pack(f"<QiiQQ{len(values)}d", 1, 1, COLMAP[name], *map(int, sides), *values)
     _is(_read(tmp_path / "cameras.bin", data), 800, fy, 639.5, 359.5, 1280, 720, distortion, model)
     for cut in (data[:-8], data[:40], data[:8], data + b"1"):
-        with pytest.raises(ValueError, match=r"got: no whole cameras\.bin of COLMAP, or"):
+        with pytest.raises(ValueError, match=r"got: a cameras\.bin of COLMAP that is cut, or"):
             _read(tmp_path / "cameras.bin", cut)
 
 
@@ -288,13 +288,13 @@ ORBextractor.nFeatures: 1200
         (
             "c.yaml",
             ORB_SLAM.format("PinHole", "", "Camera.k3: 0.1\nCamera.k4: 0.2"),
-            "Camera.k4: expected none of PinHole, got one; is Camera.type: KannalaBrandt8 missing",
+            "Camera.k4: expected no k4 of PinHole, got it; is Camera.type: KannalaBrandt8 missing",
         ),
         (
             "c.yaml",
             "{camera_model: pinhole, intrinsics: [800, 800, 640, 360], resolution: [1280, 720], "
             "distortion_coeffs: [-0.3, 0.1, 0, 0]}",
-            "distortion_model: expected the one of distortion_coeffs, got none",
+            "distortion_model: expected the lens model of distortion_coeffs, got none",
         ),
         (
             "c.json",
@@ -346,7 +346,7 @@ def test_a_matrix_of_the_binned_images_is_refused(tmp_path):  # avt_vimba_camera
     fields |= {"binning_x": 4, "binning_y": 4}
     matrix = [299.54396, 0.0, 254.14465, 0.0, 300.14093, 183.94307, 0.0, 0.0, 1.0]
     message = (
-        "camera_matrix: expected that of the full 2064 x 1544 px, got .* if it is theirs, write width 516"
+        "camera_matrix: expected one for the full 2064 x 1544 px, got .* if the matrix is for these, write w"
     )
     with pytest.raises(ValueError, match=message):
         _read(tmp_path / "c.json", json.dumps({**fields, "K": matrix}))
@@ -474,7 +474,7 @@ def test_calibrations_of_basalt_and_maplab(tmp_path):  # maplab#4
     basalt["intrinsics"][0]["camera_type"] = "ftheta"
     with pytest.raises(ValueError, match=r"camera_type: expected one of ds, eucm, pinhole, .*, got 'ftheta'"):
         _read(tmp_path / "c.json", json.dumps({"value0": basalt}))
-    with pytest.raises(ValueError, match="resolution: expected that of each camera, got none"):
+    with pytest.raises(ValueError, match="resolution: expected the image size of each camera, got none"):
         _read(tmp_path / "c.json", json.dumps({"value0": {**basalt, "resolution": None}}))
 
 
@@ -620,7 +620,7 @@ def test_a_misspelled_key_of_the_coefficients_is_an_error(tmp_path, key):
         ("k.npy", b"\x93NUMPY\1\0", "no arrays of numbers as by numpy.save"),
         ("k.mat", b"MATLAB 5.0 MAT-file, Platform: PCWIN64\0\0", "MATLAB's own format; save it as JSON"),
         ("c.zip", b"PK\x03\x04\0\0", "a ZIP archive, or a sheet of Excel; unpack it, or save"),
-        ("cameras.bin", bytes(8), "COLMAP writes texts by model_converter --output_type TXT$"),
+        ("cameras.bin", bytes(8), "convert it by colmap model_converter --output_type TXT$"),
     ],
 )
 def test_binary_files_say_how_to_write_them_as_texts(tmp_path, name, data, words):
@@ -791,7 +791,7 @@ def test_a_text_of_keys_without_a_size_is_of_the_images(tmp_path):
 
 def test_keys_that_differ_in_case_only_are_an_error(tmp_path):
     with pytest.raises(
-        ValueError, match="one of K and k, which are read alike, got both; rename one, or leave"
+        ValueError, match="one of K and k, which mean the same, got both; rename one, or leave"
     ):
         _read(tmp_path / "c.json", json.dumps({"K": MATRIX, "k": [-0.3, 0.1], "p": [0, 0], "D": []}))
 

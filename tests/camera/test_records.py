@@ -191,8 +191,8 @@ def test_rectified_images_of_a2d2_have_a_matrix_of_their_own(tmp_path):
             {**LIKE_OPENLANE, "cam_dist_coefs": LENS},
             "expected k1 .* under this key, got 'cam_dist_coefs'; rename it",
         ),
-        ({**LIKE_OPENLANE, "k4": -0.3}, r"k4: expected none of this lens \(pinhole\), got -0.3"),
-        ({**LIKE_OPENLANE, "k1": -0.3, "p1": 0.1, "model": "fisheye"}, "p1: expected none of this lens"),
+        ({**LIKE_OPENLANE, "k4": -0.3}, r"k4: expected no such coefficient of a pinhole lens, got -0.3"),
+        ({**LIKE_OPENLANE, "k1": -0.3, "p1": 0.1, "model": "fisheye"}, "p1: expected no such coefficient"),
         ({**LIKE_OPENLANE, "radial_distortion": [0.1]}, "under this key, got 'radial_distortion'; rename it"),
         (
             {**NERF, "camera_model": "EQUIRECTANGULAR"},

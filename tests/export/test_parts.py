@@ -278,7 +278,7 @@ def test_the_step_with_a_far_view_as_a_program_equals_eager():
 
 
 def test_files_of_others_are_refused(tmp_path):
-    with pytest.raises(ValueError, match="expected a file that lanebev export writes, there is none"):
+    with pytest.raises(ValueError, match="expected a file that lanebev export writes, found none"):
         OnnxPart(tmp_path / "segmenter.onnx")
     (tmp_path / "segmenter.onnx").write_bytes(b"no model")
     with pytest.raises(ValueError, match="expected an ONNX file of lanebev export, got"):

@@ -227,5 +227,5 @@ def test_inputs_are_not_outputs(tmp_path):
     check_inputs_stay(out, [tmp_path / "lanes.json", out / "drive.mp4", out / "drive" / "bev.mp4"])
     check_inputs_stay(tmp_path / "other", [out / "lanes.json"])
     for path in (out / "lanes.json", tmp_path / "link.json", tmp_path / "a" / ".." / "out" / "bev.mp4"):
-        with pytest.raises(ValueError, match=r"expected a file that the run leaves as it is, .* --out"):
+        with pytest.raises(ValueError, match=r"expected a file that the run does not replace, .* --out"):
             check_inputs_stay(out, [tmp_path / "drive.mp4", path])

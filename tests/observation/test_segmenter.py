@@ -137,7 +137,7 @@ def test_weights_round_trip_in_half_precision(small, tmp_path):
 
 def test_bad_weights_are_one_clear_line(small, tmp_path):
     path = tmp_path / "w.safetensors"
-    with pytest.raises(ValueError, match="there is none"):
+    with pytest.raises(ValueError, match="found none"):
         load_segmenter(path)
     save_segmenter(small, path)
     path.write_bytes(path.read_bytes()[:-100])

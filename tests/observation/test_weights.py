@@ -105,5 +105,5 @@ def test_what_is_no_weights_file_says_what_it_is(tmp_path, segmenter):
     with torch.no_grad():
         broken.head.weight[0, 0] = torch.nan
     save_segmenter(broken, path)
-    with pytest.raises(ValueError, match="expected finite numbers, got others"):
+    with pytest.raises(ValueError, match="expected finite numbers, got NaN"):
         load_segmenter(path)

@@ -350,17 +350,17 @@ def test_a_speed_that_does_not_fit(model):
 def test_tensors_on_different_devices_are_named(model):
     """Meta stands for a GPU."""
     with pytest.raises(
-        ValueError, match=r"intrinsics: expected on cpu as the image, got on meta; move it there"
+        ValueError, match=r"intrinsics: expected on cpu like the image, got on meta; move it there"
     ):
         model(IMAGE, SMALL_K.to("meta"))
-    with pytest.raises(ValueError, match="reset: expected on cpu as the image, got on meta"):
+    with pytest.raises(ValueError, match="reset: expected on cpu like the image, got on meta"):
         model(IMAGE, SMALL_K, reset=torch.tensor([True]).to("meta"))
     pose = POSE._replace(height=POSE.height.to("meta"))
-    with pytest.raises(ValueError, match=r"extrinsics.height: expected on cpu as the image, got on meta"):
+    with pytest.raises(ValueError, match=r"extrinsics.height: expected on cpu like the image, got on meta"):
         BEVWarp(GRID)(IMAGE, K, pose)
     for calibrator in CALIBRATORS:
         state = calibrator.initial_state(1, device="meta")
-        with pytest.raises(ValueError, match="state: expected on cpu as the intrinsics, got on meta"):
+        with pytest.raises(ValueError, match="state: expected on cpu like the intrinsics, got on meta"):
             calibrator(SEGMENTS, K, state, 0.1)
 
 

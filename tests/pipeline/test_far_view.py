@@ -139,9 +139,9 @@ def test_a_known_mount_places_the_horizon_before_the_first_frame():
 
 def test_a_far_view_is_refused_where_it_has_no_effect(drive, models):
     _, camera = drive
-    with pytest.raises(ValueError, match="far view: expected another part than the extractor, which has"):
+    with pytest.raises(ValueError, match="far view: expected another part than the extractor, which takes"):
         make_part("extractor", models[1], camera)
-    with pytest.raises(ValueError, match="far view: expected the network's lanes"):
+    with pytest.raises(ValueError, match="far view: expected lanes of the network"):
         RunConfig("drive.mp4", camera="camera.yaml", far_view=True, lanes="lanes.json")
 
 

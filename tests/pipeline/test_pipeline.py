@@ -202,7 +202,9 @@ def test_the_pose_is_less_sure_by_the_networks_factor():
 
 def test_parts_that_number_other_boundaries_are_refused():
     net = LaneSegmenter(replace(SMALL, num_boundaries=4))
-    with pytest.raises(ValueError, match=r"num_boundaries: expected the same of both, got 4 .* and 6 of"):
+    with pytest.raises(
+        ValueError, match=r"num_boundaries: expected the same of segmenter and calibrator, got 4 and 6"
+    ):
         LaneBEV(net, LineExtractor(), JointCalibrator())
     LaneBEV(net, LineExtractor(), JointCalibrator(num_boundaries=4))
 

@@ -44,14 +44,14 @@ class ExportConfig:
         if not self.camera:
             raise ValueError("camera: expected --camera FILE, got none")
         if self.int8 and (self.format != "onnx" or "segmenter" not in self.parts):
-            raise ValueError("int8: expected --format onnx and the part segmenter with it, got another")
+            raise ValueError("int8: expected --format onnx and the part segmenter, got other ones")
         if self.far_view and self.part in ("extractor", "warp"):
             raise ValueError(
                 f"part: expected segmenter, {', '.join(CALIBRATORS)} or step with --far-view, "
-                f"got {self.part}, of which such a run needs no file"
+                f"got {self.part}, which a run with a far view does not read from a file"
             )
         if self.far_view and self.int8:
-            raise ValueError("int8: expected no far view with it, got both; leave one of them out")
+            raise ValueError("int8: expected --int8 or --far-view, got both; leave one of them out")
 
     @property
     def parts(self) -> tuple[str, ...]:

@@ -197,11 +197,11 @@ class RunConfig:
         self._check_calibrator()
         self._check_backend()
         if self.smooth and self.stills:
-            raise ValueError("smooth: expected a drive with it, got --stills")
+            raise ValueError("smooth: expected a drive, got --stills")
         if self.speed and self.speed_topic:
             raise ValueError("speed: expected a file or a topic, got both; leave one of them out")
         if self.stills and (self.speed or self.speed_topic):
-            raise ValueError("speed: expected a drive with it, got --stills")
+            raise ValueError("speed: expected a drive, got --stills")
         if self.stills and self.resume:
             raise ValueError("resume: expected a drive, got --stills; images on their own have no state")
         self._check_lanes()
@@ -216,11 +216,11 @@ class RunConfig:
                 sides = ", ".join(("top", "left", "height", "width")[-len(least) :])
                 raise ValueError(f"{name}: expected whole px of an image, ({sides}), got {value}")
             if not self.lanes:
-                raise ValueError(f"{name}: expected --lanes with it, got none")
+                raise ValueError(f"{name}: expected --lanes too, got none")
         given = next((name for name in ("weights", "far_view") if getattr(self, name)), None)
         if self.lanes and given:
             raise ValueError(
-                f"{given.replace('_', ' ')}: expected the network's lanes, got --lanes as well; leave one of "
+                f"{given.replace('_', ' ')}: expected lanes of the network, got --lanes too; leave one of "
                 "them out"
             )
 
@@ -237,7 +237,7 @@ class RunConfig:
             raise ValueError(f"calibrator: expected {' or '.join(CALIBRATORS)}, got {self.calibrator!r}")
         for name in ("mount", "hilly", "smooth"):
             if getattr(self, name) and self.calibrator != "joint":
-                raise ValueError(f"{name}: expected --calibrator joint with it, got {self.calibrator}")
+                raise ValueError(f"{name}: expected --calibrator joint, got {self.calibrator}")
 
     def _check_backend(self) -> None:
         if self.backend not in BACKENDS:
@@ -250,15 +250,15 @@ class RunConfig:
         given = given or ("precision" if self.precision != "float32" else None)
         if self.backend != "torch" and given:
             raise ValueError(
-                f"{given.replace('_', ' ')}: expected --backend torch with it, got {self.backend}; an "
-                "exported calibrator and network have their own, and run on the CPU"
+                f"{given.replace('_', ' ')}: expected --backend torch, got {self.backend}; an "
+                "exported calibrator and network have their own settings, and run on the CPU"
             )
 
     def _check_lens(self) -> None:
         if not self.camera and self.fov is None and not is_bag(self.source):
             raise ValueError("camera: expected --camera FILE, or --fov DEG if no file is at hand, got none")
         if self.camera and self.fov is not None:
-            raise ValueError("fov: expected no --camera beside it, got both; leave one of them out")
+            raise ValueError("fov: expected --camera or --fov, got both; leave one of them out")
         if self.fov is not None and not 10.0 <= self.fov <= 179.0:
             raise ValueError(
                 f"fov: expected a horizontal field of view of 10 to 179 degrees, got {self.fov:g}"

@@ -123,7 +123,7 @@ def with_precision(model: LaneBEV, precision: str) -> LaneBEV:
     try:
         lower()
     except RuntimeError as error:
-        raise ValueError(f"precision: expected one of this {device}, got {precision}: {error}") from error
+        raise ValueError(f"precision: expected one that {device} has, got {precision}: {error}") from error
 
     def in_precision(image: Tensor) -> Tensor:
         with lower():  # one for each call: several threads call it

@@ -151,7 +151,7 @@ def _check_order(names: Sequence[str], source: str) -> None:
     wrong = [name for name, expected in zip(names, in_natural_order(names), strict=True) if name != expected]
     if alike and wrong:
         raise ValueError(
-            f"lanes: expected entries in the order of the frames of {source}, got {wrong[0]!r} out of it"
+            f"lanes: expected entries in the order of the frames of {source}, got {wrong[0]!r} out of order"
         )
 
 

@@ -68,7 +68,7 @@ def _stream(config: RunConfig, selection: Selection) -> FrameSource:
         if getattr(config, name):
             shown = without_login(config.source)
             option = name.replace("_", "-")
-            raise ValueError(f"source {shown}: expected no --{option} with a stream, got it")
+            raise ValueError(f"source {shown}: expected no --{option} with a stream; leave it out")
     return open_live(config.source, config.frame_rate, config.keep_all, selection)
 
 
@@ -91,7 +91,7 @@ def _opened(source: str, topic: str | None, fps: Fraction | None) -> FrameSource
         return open_bag_source(source, topic, fps)
     found = open_source(source, fps)
     if topic:
-        raise ValueError(f"topic: expected a bag with it, got {source}; leave it out")
+        raise ValueError(f"topic: expected a bag as the source, got {source}; leave --topic out")
     return found
 
 
@@ -99,14 +99,16 @@ def _speeds(config: RunConfig, source: FrameSource) -> Speeds | None:
     """Return the speeds of the vehicle that the settings give."""
     if config.speed_topic is not None:
         if not isinstance(source, BagSource):
-            raise ValueError(f"speed topic: expected a bag with it, got {config.source}; leave it out")
+            raise ValueError(f"speed topic: expected a bag as the source, got {config.source}")
         return bag_speeds(Path(config.source), source.topic, config.speed_topic)
     if config.speed is None:
         return None
     speeds = read_speeds(config.speed)
     if speeds.times is None and len(speeds.speeds) != source.count:
         got = f"{len(speeds.speeds)}; or add a column of times"
-        raise ValueError(f"speed {config.speed}: expected one for each of {source.count} frames, got {got}")
+        raise ValueError(
+            f"speed {config.speed}: expected a speed for each of {source.count} frames, got {got}"
+        )
     last = source.times[-1] if source.times else float(source.count / source.fps)
     if speeds.times is not None and not (speeds.times[0] <= last and speeds.times[-1] >= 0):
         raise ValueError(

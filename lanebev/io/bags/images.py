@@ -86,7 +86,7 @@ def message_image(message: Any) -> NDArray[np.uint8]:
         found = cv2.imdecode(data, cv2.IMREAD_COLOR) if len(data) else None
         if found is None or (bytes(data[:2]) == _JPEG and is_damaged_jpeg(bytes(message.data))):
             raise ValueError(
-                f"expected an image of format {message.format[:40]!r} that decodes, got another or half"
+                f"expected an image of format {message.format[:40]!r} that decodes, got one that does not"
             )
         return np.ascontiguousarray(found[..., ::-1])
     encoding, height, width, step = message.encoding, message.height, message.width, message.step

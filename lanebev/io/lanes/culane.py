@@ -80,7 +80,7 @@ def _check_last_row(y: NDArray[np.float64], last: str) -> None:
     """
     steps = np.diff(y)
     if len(steps) and not (np.all(steps > 0) or np.all(steps < 0)):
-        raise ValueError("expected rows in one direction, got others; is the file cut?")
+        raise ValueError("expected rows that only rise or only fall, got others; is the file cut?")
     if len(steps) > 2 and abs(steps[-1]) > _GAP * np.median(np.abs(steps)):
         expected = f"{y[-2] + np.median(steps[:-1]):g}"
         if expected != last and expected.startswith(last.removesuffix(".")):

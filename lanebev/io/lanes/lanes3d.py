@@ -102,7 +102,7 @@ def _of_each(key: str, fields: dict[str, Any], count: int) -> list[Any]:
     """Return what a key has for each of the lines; None for each without the key."""
     given = as_list(key, fields.get(key) or [None] * count)
     if len(given) != count:
-        raise ValueError(f"{key}: expected one for each of {count} lines, got {len(given)}")
+        raise ValueError(f"{key}: expected a value for each of {count} lines, got {len(given)}")
     return given
 
 

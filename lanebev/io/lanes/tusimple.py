@@ -121,7 +121,7 @@ def _rows(fields: dict[str, Any]) -> NDArray[np.float64]:
     else:
         rows = _benchmark_rows(fields)
     if not (all(a < b for a, b in pairwise(rows)) or all(a > b for a, b in pairwise(rows))):
-        raise ValueError("h_samples: expected rising rows, or falling ones, got others")
+        raise ValueError("h_samples: expected rows that only rise or only fall, got others")
     return checked_pixels("h_samples", np.array(rows))
 
 

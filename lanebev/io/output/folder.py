@@ -34,7 +34,7 @@ def check_inputs_stay(folder: str | Path, inputs: Iterable[str | Path]) -> None:
     for path in map(Path, inputs):
         if {path.resolve(), path.parent.resolve() / path.name} & outputs:
             raise ValueError(
-                f"input {path}: expected a file that the run leaves as it is, got one of the outputs in "
+                f"input {path}: expected a file that the run does not replace, got one of the outputs in "
                 f"{folder}; give another folder with --out"
             )
 
@@ -51,7 +51,8 @@ def check_result(path: str | Path, runs: Iterable[str | Path], inputs: Iterable[
     kept |= {Path(os.path.realpath(each)) for each in inputs}
     if Path(os.path.realpath(path)) in kept:
         raise ValueError(
-            f"out {path}: expected a file that is not read, got one that is; give another with --out"
+            f"out {path}: expected a file that the command does not read, got one of its inputs; give "
+            "another with --out"
         )
 
 

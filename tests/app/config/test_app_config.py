@@ -155,9 +155,9 @@ def test_a_bad_file_is_one_line_that_names_it(tmp_path, text, message):
         ({"calibrator": "x"}, "calibrator: expected joint or two-stage, got 'x'"),
         ({"camera": ""}, "camera: expected --camera FILE, or --fov DEG .*, got none"),
         ({"source": ""}, "source: expected a path, got none"),
-        ({"lanes_size": (360, 640)}, "lanes size: expected --lanes with it, got none"),
-        ({"lanes_crop": (0, 0, 360, 640)}, "lanes crop: expected --lanes with it, got none"),
-        ({"lanes": "l.json", "weights": "w"}, "weights: expected the network's lanes, got --lanes as well"),
+        ({"lanes_size": (360, 640)}, "lanes size: expected --lanes too, got none"),
+        ({"lanes_crop": (0, 0, 360, 640)}, "lanes crop: expected --lanes too, got none"),
+        ({"lanes": "l.json", "weights": "w"}, "weights: expected lanes of the network, got --lanes too"),
     ],
 )
 def test_settings_check_themselves(values, message):

@@ -169,8 +169,8 @@ def test_a_run_killed_in_its_second_pass_does_not_look_again(data, tmp_path, mon
 @pytest.mark.parametrize(
     ("more", "words"),
     [
-        (["--calibrator", "two-stage"], "smooth: expected --calibrator joint with it, got two-stage"),
-        (["--stills"], "smooth: expected a drive with it, got --stills"),
+        (["--calibrator", "two-stage"], "smooth: expected --calibrator joint, got two-stage"),
+        (["--stills"], "smooth: expected a drive, got --stills"),
     ],
 )
 def test_what_cannot_be_smoothed_is_one_line(data, tmp_path, capsys, more, words):
@@ -183,7 +183,7 @@ def test_what_cannot_be_smoothed_is_one_line(data, tmp_path, capsys, more, words
 def test_a_stream_has_no_second_pass(data, tmp_path, capsys):
     options = ["run", "-", "--camera", str(data / "camera.yaml"), "--smooth", "--out", str(tmp_path / "out")]
     assert main(options) == 2
-    assert "expected no --smooth with a stream, got it" in capsys.readouterr().err
+    assert "expected no --smooth with a stream" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(("num", "kilobytes"), [(6, 8.13), (4, 6.74)])

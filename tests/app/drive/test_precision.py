@@ -35,5 +35,5 @@ def test_half_precision_finds_the_same_boundaries():
 def test_a_precision_that_does_not_exist_or_fit_is_refused():
     with pytest.raises(ValueError, match="precision: expected one of float32, bfloat16, float16, got 'int8'"):
         RunConfig("drive.mp4", "camera.yaml", precision="int8")
-    with pytest.raises(ValueError, match="precision: expected --backend torch with it, got onnxruntime"):
+    with pytest.raises(ValueError, match="precision: expected --backend torch, got onnxruntime"):
         RunConfig("drive.mp4", "camera.yaml", backend="onnxruntime", precision="bfloat16")

@@ -421,7 +421,7 @@ def test_a_login_is_in_no_message_and_no_report(tmp_path, capsys, data):
 
 def test_a_topic_is_of_a_bag(capsys, data, tmp_path):
     fixed = ("--camera", data / "camera.yaml", "--out", tmp_path / "out", "--topic", "/camera/image")
-    _fails(capsys, "run", data / "drive.mp4", *fixed, word="topic: expected a bag with it, got ")
+    _fails(capsys, "run", data / "drive.mp4", *fixed, word="topic: expected a bag as the source, got ")
     _fails(capsys, "run", "-", *fixed, word="expected no --topic with a stream")
     with pytest.raises(ValueError, match="got nothing there"):
         make_source(RunConfig(str(tmp_path / "bag"), fov=60.0, topic="/camera/image"))

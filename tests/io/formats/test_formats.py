@@ -449,7 +449,7 @@ def test_what_is_read_is_not_replaced(tmp_path, capsys):
     for out in (folder / "extrinsics.csv", folder / "covariance.csv", camera, link):
         command = ["convert", str(folder), "--to", "kitti", "--camera", str(camera), "--out", str(out)]
         assert main(command) == 2
-        assert "expected a file that is not read, got one that is" in capsys.readouterr().err
+        assert "expected a file that the command does not read" in capsys.readouterr().err
     assert main(["compare", str(folder), str(folder), "--out", str(folder / "extrinsics.csv")]) == 2
     assert {path: path.read_bytes() for path in before} == before
     assert main(["compare", str(folder), str(folder), "--out", str(folder / "page.html")]) == 0

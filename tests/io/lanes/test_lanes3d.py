@@ -66,7 +66,7 @@ def test_improbable_lines_of_predictions_are_left_out(tmp_path):
         (frame,) = read_lanes(tmp_path / "1.json", MATRIX)
         assert len(frame.lines) == count
     (tmp_path / "1.json").write_text(json.dumps({**apollo, "laneLines_prob": [0.6]}))
-    with pytest.raises(ValueError, match="laneLines_prob: expected one for each of 2 lines, got 1"):
+    with pytest.raises(ValueError, match="laneLines_prob: expected a value for each of 2 lines, got 1"):
         read_lanes(tmp_path / "1.json", MATRIX)
 
 

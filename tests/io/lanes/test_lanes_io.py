@@ -75,7 +75,10 @@ def test_predictions_for_tusimples_benchmark_leave_the_rows_out(tmp_path, count,
             json.dumps({**_tusimple("b"), "lanes": [[1, 2]]}),
             r"line 2: lanes\[0\]: expected 3 numbers",
         ),
-        (json.dumps({**_tusimple("b"), "h_samples": [1, 3, 2]}), "line 2: h_samples: expected rising rows"),
+        (
+            json.dumps({**_tusimple("b"), "h_samples": [1, 3, 2]}),
+            "line 2: h_samples: expected rows that only rise",
+        ),
         (
             json.dumps({**_tusimple("b"), "lanes": [[1, "x", 3]]}),
             r"line 2: lanes\[0\]: expected finite",
@@ -141,9 +144,9 @@ def test_a_culane_point_given_twice_counts_once(tmp_path):
     [
         ("1 590 2 580\n3 590 4", "line 2: expected x y pairs, got 3"),
         ("1 590 2 580 3 570 4 56", "line 1: expected evenly spaced rows, got 570 then 56; is the file cut"),
-        ("1 590 2 600 3 570", "line 1: expected rows in one direction"),
-        ("1 590 2 580 3 580 4 570", "line 1: expected rows in one direction"),
-        ("1 590 2 580 1 590 3 570", "line 1: expected rows in one direction"),
+        ("1 590 2 600 3 570", "line 1: expected rows that only rise or only"),
+        ("1 590 2 580 3 580 4 570", "line 1: expected rows that only rise or only"),
+        ("1 590 2 580 1 590 3 570", "line 1: expected rows that only rise or only"),
         ("1 590 2 x", "line 1: points: expected finite numbers"),
         (
             "/a/b.MP4/00000.jpg 1 1 1 1",
