@@ -331,8 +331,8 @@ def _flat(value: Any) -> list[Any]:
 
 
 def _sequence(name: str, value: Any) -> list[Any]:
-    """Return a list of numbers, or the words of a text, as XML has several numbers."""
-    if isinstance(value, str) and len(words := value.split()) > 1:
+    """Return a list of numbers, or the words of a text, as XML has several numbers, or quotes."""
+    if isinstance(value, str) and len(words := value.strip("[] ").replace(",", " ").split()) > 1:
         return list(words)
     if not isinstance(value, list):
         raise ValueError(f"{name}: expected a list of numbers, got {shown(value)}")

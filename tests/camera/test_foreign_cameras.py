@@ -69,6 +69,7 @@ def _is(camera, *parameters):
         ("distortion_model: brown_conrady", "pinhole"),  # realsense-ros
         ("camera_model: OPENCV_FISHEYE", "fisheye"),
         ("distortion_model: kannala_brandt4", "fisheye"),
+        ("distortion_model: kb4", "fisheye"),
         ("distortion_model: pinhole-equi", "fisheye"),
         ("distortion_model: equidistant\nmodel: GoPro", "fisheye"),  # a product's name
         ("fisheye_model: 1", "fisheye"),
@@ -833,7 +834,7 @@ def test_matrices_without_rows_and_other_names_of_coefficients(tmp_path, key):
     lens = [-0.3, 0.1, 0.001, 0.002, 0.05]
     entries = np.ravel(MATRIX).tolist()
     fields = {"cameraMatrix": {"data": entries}, "width": 800, "height": 480}
-    for value in (lens, [lens], {"data": lens}):
+    for value in (lens, [lens], {"data": lens}, str(lens), "-0.3, 0.1, 0.001, 0.002, 0.05"):
         camera = _read(tmp_path / "c.json", json.dumps({**fields, key: value}))
         _is(camera, 633, 633, 408, 245, 800, 480, lens)
     with pytest.raises(ValueError, match="camera_matrix: expected 9 numbers, got 8"):
