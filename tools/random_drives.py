@@ -13,12 +13,24 @@ from lanebev.estimation.joint.frame_prior import FramePrior
 from lanebev.testing.moments import FPS, PLACES, Change, Moment, moments
 from lanebev.testing.motions import Pose, moved, sinusoids
 from lanebev.testing.streets import wandering
-from tools.replay.kinds import EGO_LANE, FRAMES, SHOCK, Generated, bend, drop, in_curve, knock, winding
+from tools.replay.kinds import (
+    EGO_LANE,
+    FRAMES,
+    SHOCK,
+    Generated,
+    bend,
+    changing_crossfall,
+    drop,
+    in_curve,
+    knock,
+    winding,
+)
 
 IN_CURVE = "motion up to 1.5°, 1.2 Hz, R 300 m"
 WINDING = "winding road at 3 to 12 m/s"
 CREST = "crest or dip, R 5 to 20 km"
 HILLS = "crests and dips in turn"
+CROSSFALL = "crossfall changes by 2 to 6 %"
 
 
 def _drawn(
@@ -109,6 +121,24 @@ def _hills(seed: int) -> Generated:
     def change(t: float, moment: Moment) -> Moment:
         vertical = sharpest * math.sin(first + math.pi * t / duration)
         return replace(moment, near=5.0, far=40.0, profile=vertical)
+
+    return _drawn(seed, change)
+
+
+def _crossfall(seed: int) -> Generated:
+    """Drive at 10 to 30 m/s over a change of the crossfall by 2 to 6 % in 30 to 80 m, seen from 5 to 40 m."""
+    random = Random(seed)
+    by = random.choice((-1.0, 1.0)) * random.uniform(0.02, 0.06)
+    start, length, speed = random.uniform(20.0, 60.0), random.uniform(30.0, 80.0), random.uniform(10.0, 30.0)
+
+    def change(t: float, moment: Moment) -> Moment:
+        return replace(
+            moment,
+            near=5.0,
+            far=40.0,
+            speed=speed,
+            crossfall=changing_crossfall(by, start - speed * t, length),
+        )
 
     return _drawn(seed, change)
 
@@ -207,6 +237,7 @@ KINDS: dict[str, Callable[[int], Generated]] = {
     WINDING: _winding,
     CREST: _crest,
     HILLS: _hills,
+    CROSSFALL: _crossfall,
     "lanes unequal by 2 cm": partial(_unequal, std=0.02),
     "lanes unequal by 10 cm": partial(_unequal, std=0.1),
     **{

@@ -36,6 +36,9 @@ class Moment:
     wander: Callable[[Tensor], Tensor] | None = None  # of Z (G,): boundaries beside their places (6, G) m
     curvature: Callable[[Tensor], Tensor] | None = None  # of Z ahead, 1/m
     profile: float = 0.0  # 1/m, vertical curvature of the road, positive over a crest
+    crossfall: Callable[[Tensor], Tensor] | None = (
+        None  # of Z (..., ): slope to the right less that at the camera
+    )
     visible: tuple[int, ...] = (0, 1, 2, 3, 4, 5)
     shift: int = 0  # wrong numbering of the whole frame
     near: float = 3.5
@@ -135,23 +138,31 @@ def _integral(values: Tensor, step: float) -> Tensor:
     return torch.nn.functional.pad(torch.cumulative_trapezoid(values, dx=step), (1, 0))
 
 
-def on_flat_road(road: Tensor, height: float, profile: float) -> Tensor:
-    """Compute the points of a flat road that look the same as those of a road over a crest or through a dip.
+def on_flat_road(
+    road: Tensor, height: float, profile: float, crossfall: Callable[[Tensor], Tensor] | None = None
+) -> Tensor:
+    """Compute the points of a flat road that look the same as those of a road that is not flat.
 
-    Source: the road is ½ κ Z² lower than its tangent plane below the camera, so the ray to it meets that
-    plane at h / (h + ½ κ Z²) of the way.
+    Source: the road is d = ½ κ Z² + c X lower than its tangent plane below the camera, so the ray to it meets
+    that plane at h / (h + d) of the way.
 
     Args:
         road: (..., 2) m, X and Z.
         height: h, m.
         profile: κ, 1/m, positive over a crest.
+        crossfall: c of Z, the slope down to the right less that at the camera; None is 0 everywhere.
     """
-    return road * (height / (height + 0.5 * profile * road[..., 1:].square()))
+    x, z = road.split(1, dim=-1)
+    lower = 0.5 * profile * z.square()
+    if crossfall is not None:
+        lower = lower + crossfall(z) * x
+    seen: Tensor = road * (height / (height + lower))
+    return seen
 
 
 def curves(moment: Moment, num: int = 400) -> tuple[Tensor, Tensor]:
     """Return the boundaries from near to far, (6, G, 2) px, and (6, G) bool: in the image."""
-    road = on_flat_road(road_curves(moment, num), moment.pose[3], moment.profile)
+    road = on_flat_road(road_curves(moment, num), moment.pose[3], moment.profile, moment.crossfall)
     pose = Extrinsics.unstack(torch.tensor([moment.pose], dtype=torch.float64))
     pixels, ahead_ok = image_from_road_points(road.flatten(0, 1)[None], CAMERA[None], pose)
     pixels = pixels[0].view(6, num, 2)

@@ -39,6 +39,7 @@ KINDS = (
     "winding road",
     "speed given",
     "crest",
+    "crossfall",
     "drop",
     "knock",
     "cut",

@@ -113,6 +113,27 @@ def bend(radius: float) -> Callable[[torch.Tensor], torch.Tensor]:
     return lambda z: torch.full_like(z, 1 / radius)
 
 
+def changing_crossfall(by: float, start: float, length: float) -> Callable[[torch.Tensor], torch.Tensor]:
+    """Return the crossfall less that at the camera, as a function of Z.
+
+    Args:
+        by: change of the crossfall, positive down to the right.
+        start: Z at which it begins to change, m.
+        length: of the road on which it changes, linearly, m.
+    """
+
+    def crossfall(z: torch.Tensor) -> torch.Tensor:
+        return by * ((z - start) / length).clamp(0, 1)
+
+    at_camera = float(crossfall(torch.zeros(())))
+    return lambda z: crossfall(z) - at_camera
+
+
+def _banked(t: float, moment: Moment) -> Moment:
+    """Drive at 20 m/s over 40 m in which the crossfall changes by 5 %, seen from 5 to 40 m."""
+    return replace(moment, near=5.0, far=40.0, crossfall=changing_crossfall(0.05, 30.0 - 20.0 * t, 40.0))
+
+
 _WINDING = winding(5.0, 250.0, [(300.0, 0.0, 1.0)])
 
 
@@ -223,6 +244,7 @@ GENERATED: dict[str, Generated] = {
     "crest": Generated("crest", _scenario("crest R 10 km, 5-40 m")),
     # From a crest into a dip of R = 10 km.
     "crest-and-dip": Generated("crest", _drive(_hill)),
+    "crossfall": Generated("crossfall", _drive(_banked)),
     "drop": Generated("drop", _drive(drop)),
     "drop-ego-lane": Generated("drop", _drive(_in_ego_lane(drop))),
     "knock": Generated("knock", _drive(knock(KNOCK))),
