@@ -39,7 +39,7 @@ _REPR.maxlevel, _REPR.maxstring = 3, 200
 
 
 def stand_in(begin: bytes) -> str:
-    """Return what came in place of another file, by its first bytes; empty if that is not known."""
+    """Name the kind of file that came in place of another, by its first bytes; empty if it is not known."""
     if not begin:
         return "an empty file"
     if begin.lstrip()[:14].lower().startswith((b"<!doctype html", b"<html")):
@@ -87,7 +87,7 @@ def _bytes_of_file(path: Path) -> bytes:
 
 
 def _bytes_of_pipe(path: Path) -> bytes:
-    """Return what comes through a pipe, such as the output of a command in the shell's ``<(command)``."""
+    """Return the bytes that come through a pipe, such as the output of ``<(command)`` in the shell."""
     with open_pipe(path) as pipe:
         await_bytes(pipe)
         return pipe.read()

@@ -311,7 +311,7 @@ class LaneBEV(BoundaryDetector):
     def _observe_in_turn(
         self, frames: Tensor, cameras: Tensor, distortion: Tensor | None, model: str
     ) -> Callable[[int, Any], tuple[Tensor, LaneSegments]]:
-        """Return what observes the frames of a step with the state before it, which places the far view."""
+        """Return a function that observes the frames of a step; the state before it places the far view."""
 
         def look(step: int, state: Any) -> tuple[Tensor, LaneSegments]:
             lens = (cameras[:, step], distortion, model)

@@ -42,12 +42,12 @@ class SessionResult(NamedTuple):
     """Result of one frame.
 
     Attributes:
-        stamp: s, as given; None where none was.
+        stamp: time stamp, s, as given; None if none was.
         dt: s since the frame before.
         extrinsics: pitch, yaw, roll (rad) and height (m), each (1,).
         std: their standard deviations, each (1,), in the same units.
         status: status of the pose.
-        reasons: why the pose is not, or not fully, determined, and what is doubtful in the input, in words.
+        reasons: in words, why the pose is not (fully) determined, and what in the input is doubtful.
         mount: the current mount estimate.
         mount_needs: what the mount estimate still needs, a sentence for each axis.
         calibration: pose, covariance, status and inliers as the calibrator gives them.
@@ -81,16 +81,17 @@ class Session:
     Args:
         camera: the lens.
         model: network and calibrator; None is :meth:`LaneBEV.from_pretrained`, loaded with the first frame.
-        calibrator: used instead of the model's; None is the model's, without a model a
+        calibrator: used instead of the model's. None is the model's or, if no model is given, a
             :class:`lanebev.JointCalibrator`.
-        lane_width: m, exact unless ``lane_width_std`` is given; the height is proportional to it. None is an
-            unknown one: 3.7 m with a standard deviation of 0.2 m, as in ``lanebev run``.
-        lane_width_std: standard deviation of the lane width, m; those of the height and of the mount's height
-            contain its effect. None is 0 with a ``lane_width`` or a ``lane_width_std`` in the calibrator's
-            configuration, otherwise 0.2 m. Only one of the two may be above 0.
+        lane_width: m, exact unless ``lane_width_std`` is given; the height is proportional to it. None
+            assumes 3.7 m with a standard deviation of 0.2 m, as ``lanebev run`` does.
+        lane_width_std: standard deviation of the lane width, m; the standard deviations of the height and
+            of the mount's height contain its effect. None is 0 if ``lane_width`` or the calibrator's own
+            ``lane_width_std`` is given, else 0.2 m. Only one of the two ``lane_width_std`` may be above 0.
         grid: grid of the bird's-eye view; None for no view.
         colours: order of a frame's channels: "bgr" as OpenCV reads them, or "rgb".
-        focal_std: standard deviation of the focal length as a fraction of it; the pose's contain its effect.
+        focal_std: standard deviation of the focal length as a fraction of it; the standard deviations of the
+            pose contain its effect.
         polyline_sigma: standard deviation of given polylines across their lines, px.
         device: device of the network; the filter runs on the CPU.
 
@@ -211,7 +212,7 @@ class Session:
         save_state(path, {**self.tracker.states(), **plain, "clock": self._clock.values()})
 
     def load(self, path: str | Path) -> None:
-        """Continue from a file that :meth:`save` wrote. A lane width that differs from it is a warning.
+        """Continue from a file that :meth:`save` wrote; warn if its lane width is another one.
 
         Raises:
             ValueError: the file cannot be used, or is of another calibrator or camera; nothing is changed.

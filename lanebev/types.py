@@ -135,7 +135,7 @@ AXES = ("pitch", "yaw", "roll", "height")
 
 @register_pytree
 class Extrinsics(NamedTuple):
-    """Camera pose over the road, each (B,): rad, rad, rad, m; always in this order.
+    """Camera pose over the road: pitch, yaw, roll (rad) and height (m), each (B,), always in this order.
 
     pitch > 0 is nose down, yaw > 0 points left of the lanes, roll > 0 is counter-clockwise
     seen from behind, height > 0 is above the road.
@@ -154,7 +154,7 @@ class Extrinsics(NamedTuple):
 
         Raises:
             TypeError: not numbers.
-            ValueError: angles of 90 degrees or more, as numbers of degrees are, or not finite numbers.
+            ValueError: angles of 90 degrees or more, such as numbers in degrees, or numbers not finite.
         """
         for name, angle in (("pitch", pitch), ("yaw", yaw), ("roll", roll)):
             check_number(name, angle)
@@ -198,8 +198,8 @@ class Extrinsics(NamedTuple):
     def projection(self, intrinsics: Tensor) -> Tensor:
         """Return the projection of the road's frame to undistorted pixels, (B, 3, 4).
 
-        It is K [R | t] of :meth:`camera_from_road`: the third entry of its product is the depth in m, by
-        which the first two are divided.
+        It is K [R | t] of :meth:`camera_from_road`. Divide the first two entries of its product with a point
+        by the third one, the depth in m.
 
         Args:
             intrinsics: (B, 3, 3) px.

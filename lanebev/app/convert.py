@@ -16,7 +16,7 @@ from lanebev.report.run_folder import read_run
 
 
 def writer(name: str) -> Callable[[Path, RunRecord, Iterable[Frame] | None], None]:
-    """Return what writes a run in a format, one of FORMATS, with images if the format contains them."""
+    """Return the writer of a format, one of FORMATS, with images if the format contains them."""
     check_installed([name])
     write = importlib.import_module(f"lanebev.io.formats.{FORMATS[name].module}").write
     return lambda path, record, images: write(path, record, *([images] if FORMATS[name].has_images else []))

@@ -100,7 +100,7 @@ def untracked_words(rows: Iterable[ExtrinsicsRow]) -> list[str]:
 
 
 def summary(report: Report, config: RunConfig) -> str:
-    """Return what to print when a run is done."""
+    """Return the text to print when a run is done."""
     tracking = [row for row in report.rows if row.status == "TRACKING"]
     lines = [f"{len(report.rows)} frame{'s'[: len(report.rows) != 1]}, {len(tracking)} TRACKING"]
     if tracking:

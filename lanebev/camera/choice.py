@@ -7,7 +7,7 @@ from lanebev.camera.parameters import CameraParameters
 from lanebev.numbers import shown
 
 Readers = Mapping[str, Callable[[], CameraParameters]]
-"""What reads each camera of a file, by its name; the usual one first, and "" for a file of one camera."""
+"""A reader for each camera of a file, by its name; the usual one first, and "" for a file of one camera."""
 
 _MOST_NAMES = 8  # in a message
 

@@ -60,7 +60,7 @@ def is_kitti(text: str) -> bool:
 
 
 def kitti_cameras(text: str, image_size: tuple[int, int] | None) -> Readers:
-    """Return what reads the rectified cameras of KITTI's ``calib.txt`` or ``calib_cam_to_cam.txt``.
+    """Return readers of the rectified cameras of KITTI's ``calib.txt`` or ``calib_cam_to_cam.txt``.
 
     The left colour camera is the usual one.
     """
@@ -146,7 +146,7 @@ def colmap_text(path: Path) -> str:
 
 
 def colmap_cameras(text: str) -> Readers:
-    """Return what reads the cameras of COLMAP's ``cameras.txt``, by their numbers."""
+    """Return readers of the cameras of COLMAP's ``cameras.txt``, by their numbers."""
     found = _COLMAP.findall(text)
     names = telling_names([number for number, *_ in found])
     return {name: partial(_colmap, *values) for name, (_, *values) in zip(names, found, strict=True)}

@@ -206,7 +206,7 @@ def _camera(
 
 
 def _reader_by_keys(fields: Mapping[str, Any]) -> Callable[[Mapping[str, Any]], CameraParameters] | None:
-    """Return what reads the camera of a program that its keys tell; None of others."""
+    """Return the reader of the camera of a program that its keys tell; None for others."""
     if fields.keys() == _OF_OPEN3D:  # beside a lens or a size in other keys the matrix is another program's
         return open3d
     if "ppx" in map(str.lower, fields):
@@ -215,7 +215,7 @@ def _reader_by_keys(fields: Mapping[str, Any]) -> Callable[[Mapping[str, Any]], 
 
 
 def _unordered_cameras(content: Any, image_size: tuple[int, int] | None, rectified: bool) -> Readers:
-    """Return what reads the cameras of a file that has them in no order; nothing of other files."""
+    """Return readers of the cameras of a file that has them in no order; none for other files."""
     finders = (opensfm_cameras, openmvg_cameras, depthai_cameras)
     found = (record_cameras(content, image_size, rectified), *(find(content) for find in finders))
     return next(filter(None, found), {}) or named_cameras(content, rectified, image_size)
@@ -224,7 +224,7 @@ def _unordered_cameras(content: Any, image_size: tuple[int, int] | None, rectifi
 def _ordered_cameras(
     fields: Mapping[str, Any], image_size: tuple[int, int] | None, rectified: bool
 ) -> Readers:
-    """Return what reads the cameras of a file whose first is the usual one; nothing of other files."""
+    """Return readers of the cameras of a file whose first one is the usual one; none for other files."""
     if is_kalibr(fields):
         return kalibr_cameras(fields)
     if settings := orb_slam_fields(fields):

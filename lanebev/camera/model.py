@@ -32,7 +32,7 @@ def check_camera(value: object) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """One camera's lens.
+    """A camera: its intrinsics, lens distortion and image size.
 
     Attributes:
         intrinsics: (3, 3) px.
@@ -41,7 +41,7 @@ class Camera:
             (Kannala and Brandt 2006, D = 4) or "omni" (Mei and Rives 2007, D = 5: ξ k1 k2 p1 p2), which may
             be given as "mei".
         image_size: (height, width) px.
-        remark: what is to be said of the file that it is from, such as which of its cameras it is; else
+        remark: note on the file that the camera was read from, such as which of its cameras it is; else
             empty.
     """
 
@@ -116,10 +116,10 @@ class Camera:
 
     @classmethod
     def from_fov(cls, degrees: float, width: int, height: int, dtype: torch.dtype = torch.float64) -> Camera:
-        """Make an ideal camera of a horizontal field of view, for those who know nothing else.
+        """Make an ideal camera of a horizontal field of view, for use without a calibration.
 
-        Pixels are square and the principal point is the image's centre, as hardly any real camera's is
-        exactly: poses are off by what that is wrong.
+        Pixels are square and the principal point is the image's centre. Hardly any real camera is exactly
+        so, and poses have the errors that follow from the difference.
 
         Args:
             degrees: angle between the outer edges of the leftmost and the rightmost column.
@@ -147,12 +147,12 @@ class Camera:
     ) -> Camera:
         """Read a camera file: OpenCV, ROS, Kalibr, EuRoC, CamOdoCal, KITTI, nuScenes, OpenLane, short YAML.
 
-        :func:`lanebev.camera.files.read_camera` says what each of them is.
+        :func:`lanebev.camera.files.read_camera` describes each of these formats.
 
         Args:
-            path: the file; one of several cameras is named after it, as ``camchain.yaml#cam1``.
+            path: the file; ``camchain.yaml#cam1`` chooses the camera cam1 of several.
             image_size: (height, width) px of the images, for a file without a size. Not used otherwise.
-            rectified: the images were rectified: take the projection matrix P, and no lens.
+            rectified: whether the images were rectified: then P is the camera matrix, without distortion.
 
         Raises:
             ValueError: the file is missing, cut, or holds an absurd value; one line says which.
@@ -165,7 +165,7 @@ class Camera:
 
         Args:
             fields: by name.
-            rectified: the images were rectified: take the projection matrix P, and no lens.
+            rectified: whether the images were rectified: then P is the camera matrix, without distortion.
 
         Raises:
             ValueError: an unknown field, or a missing or absurd value.
@@ -225,7 +225,7 @@ class Camera:
         return replace(self, intrinsics=resize @ self.intrinsics, image_size=(image_size[0], image_size[1]))
 
     def cropped(self, top: int, left: int, height: int, width: int) -> Camera:
-        """Return the camera of ``image[top:top+height, left:left+width]``; may reach beyond the image.
+        """Return the camera of ``image[top:top+height, left:left+width]``, which may exceed the image.
 
         Args:
             top: first row, px; negative above the image.
@@ -249,15 +249,15 @@ class Camera:
         return max_undistorted_radius(self.distortion[None], self.model)[0]
 
     def undistort_points(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Convert pixels as taken (N, 2) to undistorted ones (N, 2), and (N,) bool: such a point exists."""
+        """Convert pixels as taken (N, 2) to undistorted ones (N, 2), and tell where there is one, (N,)."""
         lens = (self.intrinsics[None], self.distortion[None], self.model)
         undistorted, valid = invert_distortion(points[None], *lens, reach=self.max_radius[None])
         return undistorted[0], valid[0]
 
     def share_without_rays(self) -> float:
-        """Return the share of the image's pixels that have no ray: the lens images nothing there.
+        """Return the fraction of the image's pixels without a ray, where the lens images nothing.
 
-        It is that of a grid of 64 x 64 pixels. Lanes there are left out.
+        It is computed on a grid of 64 x 64 pixels. Points of lanes in such pixels are left out.
         """
         height, width = self.image_size
         rows, columns = (

@@ -24,7 +24,7 @@ class CameraParameters(NamedTuple):
         distortion: coefficients in OpenCV's order, see :mod:`lanebev.geometry.distortion`.
         model: "pinhole", "fisheye" or "omni".
         image_size: (height, width) px.
-        remark: what is to be said of the file that it is from; else empty.
+        remark: note on the file that the camera was read from; else empty.
     """
 
     matrix: list[float]

@@ -93,7 +93,7 @@ def open3d(fields: Mapping[str, Any]) -> CameraParameters:
 
 
 def depthai_cameras(content: Any) -> Readers:
-    """Return what reads the cameras of a calibration of Luxonis' DepthAI, by the numbers of their sockets."""
+    """Return readers of the cameras of a calibration of Luxonis' DepthAI, by the numbers of their sockets."""
     data = content.get("cameraData") if isinstance(content, Mapping) else None
     pairs = (
         [each for each in data if isinstance(each, list) and len(each) == 2] if isinstance(data, list) else []

@@ -23,7 +23,7 @@ _OPENMVG_LENSES = {  # keys of the coefficients -> their model, and their places
 
 
 def opensfm_cameras(content: Any) -> Readers:
-    """Return what reads the cameras of ``camera_models.json``, ``cameras.json`` or ``reconstruction.json``.
+    """Return readers of the cameras of ``camera_models.json``, ``cameras.json`` or ``reconstruction.json``.
 
     Source: OpenSfM, opensfm/io.py and doc/source/geometry.rst: lengths are in shares of the longer side, from
     the middle of the image.
@@ -53,7 +53,7 @@ def _opensfm(fields: Mapping[str, Any]) -> CameraParameters:
 
 
 def openmvg_cameras(content: Any) -> Readers:
-    """Return what reads the cameras of ``sfm_data.json``, by their keys; nothing of another file.
+    """Return readers of the cameras of ``sfm_data.json``, by their keys; none for other files.
 
     Source: OpenMVG, cameras/Camera_*.hpp, whose pixels have their centres at whole numbers.
     """

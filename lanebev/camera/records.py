@@ -66,7 +66,7 @@ _PLACES = ("calib", "cameras")  # keys below which ONCE and A2D2 have their came
 
 
 def record_cameras(content: Any, image_size: tuple[int, int] | None, rectified: bool) -> Readers:
-    """Return what reads the cameras of a data set's JSON; nothing if there is none.
+    """Return readers of the cameras of a data set's JSON; none for other files.
 
     Their names are those of the file, nuScenes' tokens, or their places if these do not tell them apart.
     """

@@ -17,7 +17,7 @@ _STEREO = [  # keys of matrix and coefficients of both cameras, as of OpenCV's s
 
 
 def named_cameras(content: Any, rectified: bool, image_size: tuple[int, int] | None) -> Readers:
-    """Return what reads cameras that a file has below their names; nothing if something else is there."""
+    """Return readers of the cameras that a file has below their names; none for other files."""
     fields = content if isinstance(content, Mapping) else {}
     only = next(iter(fields.values())) if len(fields) == 1 else None
     fields = only if isinstance(only, Mapping) else fields
@@ -30,7 +30,7 @@ def named_cameras(content: Any, rectified: bool, image_size: tuple[int, int] | N
 
 
 def stereo_cameras(fields: Mapping[str, Any], rectified: bool, image_size: tuple[int, int] | None) -> Readers:
-    """Return what reads the cameras of OpenCV's stereo calibration, the left one first; nothing of others.
+    """Return readers of both cameras of OpenCV's stereo calibration, the left one first; none for others.
 
     Their names are those of their matrices.
     """

@@ -102,7 +102,7 @@ def is_kalibr(fields: Mapping[str, Any]) -> bool:
 
 
 def kalibr_cameras(fields: Mapping[str, Any]) -> Readers:
-    """Return what reads the cameras of Kalibr's camchain, or the one of EuRoC's ``sensor.yaml``."""
+    """Return readers of the cameras of Kalibr's camchain, or the one of EuRoC's ``sensor.yaml``."""
     chain = [key for key in fields if re.fullmatch(r"cam\d+", key, re.ASCII)]
     if not chain:
         return {"": partial(_kalibr, fields)}
@@ -189,7 +189,7 @@ def orb_slam_fields(fields: Mapping[str, Any]) -> Mapping[str, Any] | None:
 
 
 def orb_slam_cameras(fields: Mapping[str, Any], rectified: bool) -> Readers:
-    """Return what reads the camera in the settings of ORB-SLAM 2 or 3, or the left and the right one.
+    """Return readers of the camera in the settings of ORB-SLAM 2 or 3, or of the left and the right one.
 
     ORB-SLAM 2's ``Camera`` is that of rectified images, where ``LEFT`` and ``RIGHT`` are those as taken.
     """

@@ -17,8 +17,8 @@ class Reason(IntFlag):
         NO_START: not started yet: this frame does not determine pitch and yaw.
         ROLL_UNSEEN: at most one lane was seen, or the frame was not used: roll is not updated and its
             standard deviation grows.
-        HEIGHT_UNSEEN: no lane with both boundaries was seen, or the frame was not used: the same for the
-            height.
+        HEIGHT_UNSEEN: no lane with both boundaries was seen, or the frame was not used: the height is not
+            updated and its standard deviation grows.
         LANE_CHANGE: the boundary indices changed by one in this frame.
         RESTARTED: estimation started with this frame.
         DIRECTION_UNSEEN: at most one boundary was seen, or the frame was not used: pitch and yaw are not

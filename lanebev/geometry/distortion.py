@@ -50,7 +50,7 @@ def check_lens(distortion: Tensor | None, model: str) -> None:
 
 
 def distort_plane(plane: Tensor, distortion: Tensor, model: str) -> Tensor:
-    """Compute where the lens images points of the ideal z = 1 plane, (B, N, 2) to (B, N, 2)."""
+    """Distort points of the ideal z = 1 plane as the lens does, (B, N, 2) to (B, N, 2)."""
     if model == "fisheye":
         return kannala_brandt(plane, distortion)
     if model == "omni":

@@ -35,7 +35,7 @@ def check_distortion(distortion: Tensor | None, model: str, *rows: int) -> None:
 
 
 def _remedy(of_one: Tensor, rows: tuple[int, ...], *size: int) -> str:
-    """Return what to do with a tensor of this size, or one of one row, that should have more rows."""
+    """Return the remedy for a tensor of this size, or of one row, that should have more rows."""
     if not (rows and size) or of_one.shape not in (size, (1, *size)):
         return ""
     return f"; give it to every row by .expand({', '.join(map(str, (*rows, *size)))})"
@@ -143,7 +143,7 @@ def cam_from_image(intrinsics: Tensor) -> Tensor:
 
 @full_precision
 def distort_points(points: Tensor, intrinsics: Tensor, distortion: Tensor, model: str = "pinhole") -> Tensor:
-    """Compute where undistorted pixels are in the image as it was taken.
+    """Convert undistorted pixels to pixels as taken.
 
     Args:
         points: (B, N, 2) px, undistorted.
@@ -169,9 +169,9 @@ def distort_points(points: Tensor, intrinsics: Tensor, distortion: Tensor, model
 def undistort_points(
     points: Tensor, intrinsics: Tensor, distortion: Tensor, model: str = "pinhole"
 ) -> Tensor:
-    """Compute where pixels of the image as it was taken would be without a lens.
+    """Convert pixels as taken to undistorted pixels.
 
-    The points alone of :func:`invert_distortion`, which also says which of them are none.
+    :func:`invert_distortion` also tells for which pixels there is no such point.
 
     Args:
         points: (B, N, 2) px, distorted.
@@ -196,7 +196,7 @@ def invert_distortion(
     model: str = "pinhole",
     reach: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Compute where pixels of the image as it was taken would be without a lens, and which would be.
+    """Convert pixels as taken to undistorted pixels, and tell where there is such a point.
 
     Inverse of :func:`distort_points`: radially by Newton's method in a bracket, then in the plane by damped
     Newton, each a fixed number of steps; the gradient is the solution's own. A pixel that the lens images
@@ -207,7 +207,7 @@ def invert_distortion(
         intrinsics: (B, 3, 3).
         distortion: (B, D).
         model: "pinhole", "fisheye" or "omni" ("mei").
-        reach: (B,) of :func:`max_undistorted_radius`, for those who call often; None computes it.
+        reach: (B,) of :func:`max_undistorted_radius`, which saves time in many calls; None computes it.
 
     Returns:
         (B, N, 2) px, undistorted, and (B, N) bool, false where there is no such point; what is returned

@@ -73,7 +73,7 @@ def road_from_image_points(
         points: (B, N, 2) px.
         intrinsics: (B, 3, 3).
         extrinsics: each (B,).
-        vertical_curvature: (B,) 1/m, of a road that is not a plane, positive over a crest; see (J1).
+        vertical_curvature: (B,) 1/m of the road, positive over a crest, see (J1); None for a plane.
 
     Returns:
         (B, N, 2) m, (X right, Z along the lanes), and (B, N) bool, false above the horizon or behind; of a
@@ -111,7 +111,7 @@ def image_from_road_points(
         points: (B, N, 2) m, (X right, Z along the lanes).
         intrinsics: (B, 3, 3).
         extrinsics: each (B,).
-        vertical_curvature: (B,) 1/m, of a road that is not a plane, positive over a crest; see (J1).
+        vertical_curvature: (B,) 1/m of the road, positive over a crest, see (J1); None for a plane.
 
     Returns:
         (B, N, 2) px, and (B, N) bool, false behind the camera, beyond 0.8 of the distance at which a crest

@@ -29,7 +29,7 @@ _TOLERANCE = 1e-5  # error of a solution on the z = 1 plane: 0.01 px at a focal 
 
 
 def undistort_plane(plane: Tensor, distortion: Tensor, model: str, reach: Tensor) -> tuple[Tensor, Tensor]:
-    """Compute which points of the ideal z = 1 plane a lens images at these.
+    """Compute the points of the ideal z = 1 plane from their distorted images.
 
     Args:
         plane: (B, N, 2) as imaged.

@@ -1,4 +1,4 @@
-"""``calibration.yaml``: the lens and how it is mounted, in formats others read."""
+"""``calibration.yaml``: the camera's lens and mount, in formats that other programs read."""
 
 import math
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""``covariance.csv``: every frame's covariance, which ``extrinsics.csv`` has the diagonal of."""
+"""``covariance.csv``: the covariance matrix of every frame."""
 
 import csv
 import itertools
@@ -16,7 +16,7 @@ COVARIANCE_COLUMNS = ("frame", *(f"{AXES[i]}_{AXES[j]}" for i, j in PAIRS))
 
 
 def write_covariances(path: str | Path, covariances: Iterable[NDArray[np.float64]]) -> None:
-    """Write a header and one row per frame: the upper triangle, row by row, rad² , rad m and m².
+    """Write a header and one row per frame: the upper triangle, row by row, rad², rad m and m².
 
     Args:
         path: the file.

@@ -17,7 +17,7 @@ class Frame(NamedTuple):
         dt: s since the frame before; of the first, the source's nominal interval.
         name: the image's path as found, empty for a video.
         image: (H, W, 3) uint8 RGB, or None if it did not decode.
-        problem: why not, or what else is to be said of it; else empty.
+        problem: why not, or another remark on the frame; else empty.
         source_number: its number in the whole source, where only some of its frames are taken; else None.
         speed: speed of the vehicle, m/s; None if it is not known.
     """

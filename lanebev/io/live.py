@@ -1,4 +1,4 @@
-"""Cameras and streams: frames as they come, the newest first where not all can be processed."""
+"""Cameras and streams: frames as they come; if not all can be processed, the newest is."""
 
 from __future__ import annotations
 

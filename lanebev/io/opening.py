@@ -151,7 +151,7 @@ class _Survey(NamedTuple):
         declared: s, as the header says it.
         is_edited: whether an edit list leaves out frames.
         is_complete: whether the packets tell which frames are shown.
-        problems: what is to be said of them.
+        problems: remarks on them.
     """
 
     shown: list[int]

@@ -89,7 +89,7 @@ def load_state(
     like: Mapping[str, Any] | None = None,
     device: torch.device | str | None = None,
 ) -> LoadedState:
-    """Read a file of :func:`save_state`. Never half: any problem is reported and nothing is used.
+    """Read a file of :func:`save_state`. If there is a problem, it is reported and nothing is used.
 
     Args:
         path: path of the file.

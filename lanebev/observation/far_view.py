@@ -22,15 +22,16 @@ _LEAST_VERTICES = 4  # vertices of a boundary in the far view, below which those
 
 @dataclass(frozen=True)
 class FarView:
-    """Sizes of the two inputs of the network, which together have as many pixels as one input without.
+    """Sizes of the network's two inputs, which together have as many pixels as one without a far view.
 
     The defaults were chosen on TuSimple's and CARLA's images (``docs/benchmarks/far_view.md``).
 
     Attributes:
         whole: width of the whole image's input as a fraction of that of the input without a far view.
-        rows: height of the far view's input as a fraction of the same; its width is what is left.
-        magnification: pixels per degree of the far view over those of the input without. Beyond the camera's
-            resolution it is not enlarged.
+        rows: height of the far view's input as a fraction of that of the input without a far view; its width
+            follows from the number of pixels.
+        magnification: ratio of the far view's pixels per degree to those of the input without a far view.
+            The far view never has more pixels per degree than the camera.
         above: fraction of the far view's height that is above the vanishing point.
 
     Raises:

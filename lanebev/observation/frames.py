@@ -51,7 +51,7 @@ def check_frame(frame: NDArray[np.uint8] | Tensor, image_size: tuple[int, int]) 
 
 
 def _remedy(frame: NDArray[np.generic], image_size: tuple[int, int]) -> str:
-    """Return what to do about an array that is no frame of this size."""
+    """Return the remedy for an array that is no frame of this size."""
     if frame.shape == (3, *image_size):
         return "channels go last, see np.moveaxis(frame, 0, -1)"
     if frame.shape[:2] != image_size:

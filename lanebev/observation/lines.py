@@ -38,14 +38,14 @@ class LineExtractor(nn.Module):
 
     @classmethod
     def for_network(cls, network: SegmenterConfig, correlation: float = NETWORK_CORRELATION) -> LineExtractor:
-        """Return the extractor for a network's maps; for single frames ``correlation`` is not used."""
+        """Return the extractor for a network's maps; single frames are calibrated without ``correlation``."""
         stride, factor = network.output_stride, network.sigma_scale
         return cls(LineConfig(stride=stride, sigma_scale=factor, correlation=correlation))
 
     def forward(
         self, logits: Tensor, image_size: tuple[int, int], network_size: tuple[int, int] | None = None
     ) -> LaneSegments:
-        """Extract segments in pixels of the given image; it must be undistorted if they are to be.
+        """Extract segments in pixels of the given image; they are undistorted only if the image is.
 
         Args:
             logits: as for :meth:`vertices`.

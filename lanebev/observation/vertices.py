@@ -28,8 +28,8 @@ class LineConfig:
         window: half-width of the window about a scan's peak, label px.
         min_mass, full_mass: sums of a scan's probabilities, as fractions of a stripe's, up to which the scan
             has weight 0 (no boundary), and from which it has weight 1.
-        max_mass: fraction from which the scan crosses the boundary more than once, as where it turns back at
-            the horizon, and is not used; its weight decreases over 0.2 below that.
+        max_mass: fraction from which a scan is not used: it crosses the boundary more than once, as where
+            the boundary turns back at the horizon; its weight decreases over 0.2 below that.
         min_vertices: a boundary with fewer counts as not seen.
         sigma_floor: least standard deviation of a vertex, label px, by errors that correlate along the line.
         sigma_scale: factor on all standard deviations; 1 for exact maps.

@@ -135,7 +135,7 @@ def render_comparison(first: RunFolder, second: RunFolder) -> str:
 
 
 def _summary(letter: str, run: RunFolder, rows: Sequence[ExtrinsicsRow], stills: bool) -> dict[str, Any]:
-    """Return what the page shows of one run, its verdict over the common frames."""
+    """Return the values of one run that the page shows, with its verdict over the common frames."""
     result, several = verdict(rows, stills), len(rows) > 1
     return {
         "letter": letter,
@@ -149,7 +149,7 @@ def _summary(letter: str, run: RunFolder, rows: Sequence[ExtrinsicsRow], stills:
 
 
 def comparison_summary(first: RunFolder, second: RunFolder) -> str:
-    """Return what to print: the frames in common, how each axis differs, the settings that do."""
+    """Return the text to print: the frames in common, how each axis differs, the settings that do."""
     pairs = common_frames(first, second)
     lines = [f"{len(pairs)} frame{'s'[: len(pairs) != 1]} in common; {second.name} minus {first.name}:"]
     for each in differences(pairs):

@@ -86,7 +86,7 @@ def write_report(path: str | Path, report: Report) -> None:
 
 
 def page_context(report: Report) -> dict[str, Any]:
-    """Return what the template shows."""
+    """Return the values that the template shows."""
     rows, stills = report.rows, report.is_stills
     found = verdict(rows, stills)
     worst = [] if stills else worst_moments(rows)
@@ -119,7 +119,7 @@ def page_context(report: Report) -> dict[str, Any]:
 
 
 def page_data(report: Report, places: Sequence[int], edges: NDArray[np.float64]) -> dict[str, Any]:
-    """Return what the page's script shows of each frame, as plain values."""
+    """Return the values of each frame that the page's script shows, as plain values."""
     rows = [report.rows[place] for place in places]
     reasons = list(dict.fromkeys(row.reasons for row in rows))
     return {

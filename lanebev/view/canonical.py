@@ -52,7 +52,7 @@ class CanonicalView(nn.Module):
 
     A network that was trained for one mount then sees that mount. Rotation is exact. A difference in height
     is exact for the road; what stands on the road is moved as if it lay on it. What is above the horizon is
-    taken to be far away. The lens distortion is taken out in the same single resampling.
+    taken to be far away. The same single resampling removes the lens distortion.
 
     Args:
         intrinsics: (3, 3) px of the virtual camera.

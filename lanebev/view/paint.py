@@ -39,11 +39,11 @@ class PixelCells(NamedTuple):
 class ImageFromBEV(nn.Module):
     """Resamples a bird's-eye map to the image that would show it on the road; differentiable.
 
-    For labels, masks or heat maps of the road that are wanted in the image, as a camera takes it.
+    It moves labels, masks or heat maps of the road into the image as the camera takes it.
 
     Args:
         grid: grid of the map; default :class:`BEVGrid`.
-        plane_height: m above the road of the plane that the map lies in.
+        plane_height: height above the road, m, of the plane that contains the map.
     """
 
     def __init__(self, grid: BEVGrid | None = None, plane_height: float = 0.0) -> None:

@@ -35,8 +35,8 @@ class BEVWarp(nn.Module):
 
     Args:
         grid: the road's rectangle; default :class:`BEVGrid`.
-        plane_heights: m above the road, of P planes parallel to it that are sampled instead of the road, as
-            heads that sample volumes need them.
+        plane_heights: heights above the road, m, of P planes parallel to it that are sampled instead of the
+            road, for detection heads that sample volumes.
     """
 
     def __init__(self, grid: BEVGrid | None = None, plane_heights: Sequence[float] | None = None) -> None:
@@ -71,9 +71,9 @@ class BEVWarp(nn.Module):
             model: "pinhole", "fisheye" or "omni", the lens of ``distortion``.
             image_size: (H, W) px of the image that the intrinsics belong to; None where that is ``image``
                 itself.
-            strides: of the map, or of each map, px: cell j is centred on pixel stride · j, as those of a
+            strides: stride of the map, or of each map, px: cell j is centred on pixel stride · j, as in a
                 convolutional trunk with symmetric padding. None: cells are evenly spread over the image, as
-                those of pooling or patches.
+                after pooling or with patches.
             vertical_curvature: (B,) 1/m of the road, positive over a crest, such as a calibrator's
                 ``vertical_curvature(state)``; None for a plane.
 

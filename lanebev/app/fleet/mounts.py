@@ -61,7 +61,7 @@ class Stretch:
 
 
 def drive_mounts(states: Sequence[tuple[str, str, MountState]]) -> list[DriveMount]:
-    """Return what each drive of one camera says of the mount, and where the camera was moved.
+    """Return the mount estimate of each drive of one camera, and where the camera was moved.
 
     Args:
         states: name, time and the mount's state at the end of each drive, in order of time.

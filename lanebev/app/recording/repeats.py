@@ -55,7 +55,7 @@ class RepeatedFrames:
         self._before = seen
 
     def remark(self) -> str:
-        """Return what to say of the drive; empty if few frames are repeated."""
+        """Return a remark on the drive; empty if few frames are repeated."""
         changes = self._changes.all()
         count = int(repeated(changes).sum()) if len(changes) else 0
         many = max(_MOST_COUNT, _MOST_SHARE * len(changes))

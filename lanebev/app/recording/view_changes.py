@@ -91,7 +91,7 @@ class ViewChanges:
             self._first.setdefault(kind, change.number)
 
     def remark(self) -> str:
-        """Return what to say of the drive; empty if its view stays."""
+        """Return a remark on the drive; empty if its view stays."""
         if self._compared >= _FEWEST and self._in_turn > _MOST * self._compared:
             return (
                 "images differ more from the one before than from the last but one: are they of two cameras "

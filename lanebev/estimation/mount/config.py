@@ -17,7 +17,7 @@ class MountConfig:
         margin: hysteresis of the limits.
         largest_std: largest standard deviation of a frame's pose with which it is used on that axis.
         block_std: prior standard deviation of blocks.
-        prior_blocks: number of blocks as which ``block_std`` counts.
+        prior_blocks: number of blocks that ``block_std`` counts as.
         block_correlation: correlation of neighbouring blocks, due to slow motion.
         prior_pose, prior_std: mean and standard deviation of the prior.
         moved_least: smallest change that counts as a moved camera.

@@ -34,7 +34,7 @@ class TwoStageConfig:
         min_segments: number of segments that must support a vanishing point.
         min_inlier_share: fraction of the segments that must support it.
         reacquire_after: time without support after which the search starts again, s.
-        reacquire_spread: standard deviation of the predicted direction above which it does too, rad.
+        reacquire_spread: standard deviation of the predicted direction, rad, above which it also starts.
         lost_after: time without support after which the status is LOST, s.
         assumed_dt: time between frames, s, where it is not finite.
         lane_noise: standard deviation of each lane's width about the prior, m.

@@ -181,7 +181,7 @@ class _RosFactory:
     """Gives mcap's reader what decodes messages of ROS 1 and 2, as its ``DecoderFactory`` does."""
 
     def decoder_for(self, message_encoding: str, schema: Any) -> Any:
-        """Return what decodes the messages of a schema; None for those of others."""
+        """Return the decoder of a schema's messages; None if it is unknown."""
         if schema is None or (message_encoding, schema.encoding) not in _ROS:
             return None
         from rosbags.typesys import Stores, get_types_from_msg, get_typestore

@@ -47,13 +47,13 @@ def glob_pattern(source: str) -> str:
 
 
 def folder_remedy(folder: Path) -> str:
-    """Return what to give instead of a folder without images."""
+    """Return a hint on the source to give instead of a folder without images."""
     below = f"for images in folders below it give a quoted glob such as '{folder}/**/*.jpg'"
     return "; ".join(filter(None, [endings_remedy(folder.iterdir()), below]))
 
 
 def endings_remedy(paths: Iterable[Path]) -> str:
-    """Return what to give instead of files that are no images; empty if there are none."""
+    """Return a hint on the source to give instead of files that are no images; empty if there are none."""
     endings = sorted({each.suffix for each in paths if each.is_file() and each.name[0] != "."})
     known = " ".join(IMAGE_SUFFIXES)
     found = f"its files end with {' '.join(endings[:5])}, images with {known}; give a video itself"

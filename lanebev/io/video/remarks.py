@@ -27,7 +27,7 @@ _OF_TWO_CAMERAS = range(1, 8)  # AVStereo3DType: side by side, one above the oth
 def stream_remarks(
     container: av.container.InputContainer, frame: av.VideoFrame, image: NDArray[np.uint8]
 ) -> list[str]:
-    """Return what to say of a video by its streams and its first frame.
+    """Return remarks on a video by its streams and its first frame.
 
     Args:
         container: the video.
