@@ -200,7 +200,7 @@ def _repeats_end(points: NDArray[np.float64]) -> NDArray[np.bool_]:
     They are two or more of one x on evenly spaced rows, along which the line would move by more than a pixel
     if it went on as before; a curve becomes vertical by and by, and a line on a grid is so elsewhere too. Of
     whole numbers, which rounding repeats, they are three or more and it moves so from row to row, or two and
-    it moves by more than three.
+    it moves by more than three, or many and it would move by ten along them (:func:`_moves_on`).
     """
     found = np.zeros(len(points), dtype=bool)
     there = np.flatnonzero(np.isfinite(points).all(-1))
@@ -212,9 +212,26 @@ def _repeats_end(points: NDArray[np.float64]) -> NDArray[np.bool_]:
             continue
         before, earlier = steps[same : same + 2]
         least = _ROUNDED if whole and same == 1 else 1.0
-        if before * (1 if whole else same) > least and before > _ABRUPT * earlier > 0:
+        is_fast = before * (1 if whole else same) > least and before > _ABRUPT * earlier > 0
+        if is_fast or (whole and _moves_on(points[own, 0], same)):
             found[own[: same + 1]] = True
     return found
+
+
+def _moves_on(x: NDArray[np.float64], same: int) -> bool:
+    """Tell whether whole numbers would move by 10 px along their first steps, as they do behind these.
+
+    A curve that becomes vertical there would move by 2 to 8 px, one that is so for longer moves ever faster.
+
+    Args:
+        x: px, in order from an end of the line.
+        same: number of steps of 0 at this end.
+    """
+    count = min(same, (len(x) - 1 - same) // 2)
+    if count < 1:
+        return False
+    first, second = np.abs(np.diff(x[[same, same + count, same + 2 * count]]))
+    return bool(first >= 5.0 and first * same >= 10.0 * count and first > _ABRUPT * second)
 
 
 def _indices(lines: Sequence[LaneLine], camera: Camera, num_boundaries: int) -> list[int | None]:

@@ -67,7 +67,7 @@ def open_video(source: str) -> av.container.InputContainer:
         tell_damage(stream.codec_context)
     if not moving_pictures(container):
         container.close()
-        raise ValueError(f"video {source}: expected a video stream, got none")
+        raise ValueError(f"video {source}: expected a video stream, got none; is it cut, or sound alone?")
     return container
 
 

@@ -130,6 +130,29 @@ def test_a_whole_number_that_is_repeated_once_is_missing_where_the_line_moves_fa
 
 
 @pytest.mark.parametrize("order", [1, -1])
+@pytest.mark.parametrize("slope", [-1.3, -0.7, -0.4, 0.4, 1.0])  # px a row
+def test_whole_numbers_that_a_slow_line_repeats_at_its_end_are_missing(slope, order):
+    """As by the columns of a mask on every row."""
+    rows = np.arange(300.0, 700.0)
+    x = np.round(640 + slope * (np.maximum(rows, 360) - 300))
+    found, expected = (
+        vertices_from_lines([LaneLine(np.stack([x, rows], -1)[part][::order], 2)], CAMERA)
+        for part in (slice(None), slice(65, None))
+    )
+    np.testing.assert_array_equal(found.points[0, 2, :33], expected.points[0, 2, :33])
+    np.testing.assert_array_equal(found.weight, expected.weight)
+
+
+@pytest.mark.parametrize("begin", [0.0, 10.0, 25.0, 60.0])  # rows from the end to where the curve is vertical
+@pytest.mark.parametrize("power", [2, 3, 4])
+@pytest.mark.parametrize("bend", [3.0, 30.0, 300.0])  # px at the other end
+def test_whole_numbers_of_a_curve_that_becomes_vertical_are_whole(bend, power, begin):
+    rows = np.arange(300.0, 700.0)
+    x = np.round(640 + bend * ((rows - 300 - begin) / 400) ** power)
+    assert vertices_from_lines([LaneLine(np.stack([x, rows], -1), 2)], CAMERA).weight.sum() == 40
+
+
+@pytest.mark.parametrize("order", [1, -1])
 def test_a_point_in_the_corner_is_padding(order):
     padded = [np.concatenate([line[::order], [[0.0, 0.0]]]) for line in (LEFT, RIGHT)]
     found, expected = (
