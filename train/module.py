@@ -24,6 +24,7 @@ from train.losses import boundary_cross_entropy, row_cross_entropy, unweighted_b
 from train.metrics import point_recall
 from train.scores import BenchmarkScores
 
+_STRENGTHS = "photometric."  # begin of the names of the augmentation's buffers, which are no weights
 _NOT_LABELLED = -1  # class of a pixel without weight
 
 
@@ -124,7 +125,15 @@ class Segmentation(L.LightningModule):
         checkpoint["settings"] = self.settings
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Refuse another network's in one line, not in one of each weight, and another optimizer's state."""
+        """Refuse another network's in one line, not in one of each weight, and another optimizer's state.
+
+        The strength of augmentation is that of this run, which may have none.
+        """
+        strengths = {name: part for name, part in self.state_dict().items() if name.startswith(_STRENGTHS)}
+        for key in checkpoint.keys() & {"state_dict", "current_model_state"}:  # the second beside averages
+            parts = checkpoint[key].items()
+            weights = {name: part for name, part in parts if not name.startswith(_STRENGTHS)}
+            checkpoint[key] = weights | strengths
         own, other = self.settings["network"], checkpoint["settings"]["network"]
         for name in sorted(own.keys() - {"image_size", "sigma_scale", "pose_sigma_scale"}):
             if own[name] != other[name]:

@@ -175,6 +175,26 @@ def test_a_finished_run_goes_on_at_its_own_rate(tmp_path, monkeypatch):
     assert decays == [0.02] * 4 + [0.1] * 2
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("strength", [0.0, 1.0])
+def test_a_run_goes_on_with_other_augmentation(strength, tmp_path, monkeypatch):
+    """Also with averaged weights, beside which a checkpoint has the others."""
+    ranges = []
+    step = Segmentation.training_step
+
+    def noted(self, batch, batch_idx):
+        buffers = dict(self.named_buffers())
+        ranges.append([part.tolist() for name, part in buffers.items() if "brightness" in name])
+        return step(self, batch, batch_idx)
+
+    monkeypatch.setattr(Segmentation, "training_step", noted)
+    averaged = "--trainer.callbacks+=lightning.pytorch.callbacks.EMAWeightAveraging"
+    run("fit", "fast.yaml", tmp_path, "--trainer.max_steps=1", averaged)
+    options = ["--trainer.max_steps=2", averaged, f"--model.init_args.augment={strength}", "--ckpt_path=last"]
+    run("fit", "fast.yaml", tmp_path, *options)
+    assert ranges == [[pytest.approx([0.825, 1.175])], [pytest.approx([0.65, 1.35])] if strength else []]
+
+
 def test_last_of_nothing_is_an_error(tmp_path, capsys):
     with pytest.raises(SystemExit) as stop:
         run("fit", "fast.yaml", tmp_path, "--ckpt_path=last")
