@@ -24,7 +24,6 @@ from train.losses import boundary_cross_entropy, row_cross_entropy, unweighted_b
 from train.metrics import point_recall
 from train.scores import BenchmarkScores
 
-_STRENGTHS = "photometric."  # begin of the names of the augmentation's buffers, which are no weights
 _NOT_LABELLED = -1  # class of a pixel without weight
 
 
@@ -129,11 +128,14 @@ class Segmentation(L.LightningModule):
 
         The strength of augmentation is that of this run, which may have none.
         """
-        strengths = {name: part for name, part in self.state_dict().items() if name.startswith(_STRENGTHS)}
+        strengths = _of_augmentation(self.state_dict())
         for key in checkpoint.keys() & {"state_dict", "current_model_state"}:  # the second beside averages
-            parts = checkpoint[key].items()
-            weights = {name: part for name, part in parts if not name.startswith(_STRENGTHS)}
-            checkpoint[key] = weights | strengths
+            former = _of_augmentation(checkpoint[key])
+            if strengths.keys() != former.keys() or not all(
+                torch.allclose(part, former[name].to(part)) for name, part in strengths.items()
+            ):
+                weights = {name: part for name, part in checkpoint[key].items() if name not in former}
+                checkpoint[key] = weights | strengths
         own, other = self.settings["network"], checkpoint["settings"]["network"]
         for name in sorted(own.keys() - {"image_size", "sigma_scale", "pose_sigma_scale"}):
             if own[name] != other[name]:
@@ -249,6 +251,11 @@ class Segmentation(L.LightningModule):
             groups[0]["weight_decay"] = self.settings["weight_decay"]
         if self.compiled:
             self.segmenter.compile()  # in place: weights keep their names
+
+
+def _of_augmentation(state: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Return the augmentation's buffers among a module's weights."""
+    return {name: part for name, part in state.items() if name.startswith("photometric.")}
 
 
 _SETTINGS = (
