@@ -121,7 +121,7 @@ class LaneSegmenter(nn.Module):
         _check_scale(image)
         image = image.to(self.head.weight.dtype)
         mean, std = (constant(each, like=image).view(3, 1, 1) for each in (IMAGENET_MEAN, IMAGENET_STD))
-        stem, c2, c3, c4, c5 = self.trunk((image - mean) / std)
+        stem, c2, c3, c4, c5 = self.trunk(self._in_order((image - mean) / std))
         lateral2, lateral3, lateral4, lateral5 = self.lateral
         x = lateral5(c5) + self.position(_positions(c5))
         x = lateral4(c4) + upsample_aligned(x, c4.shape[-2:])
@@ -137,6 +137,16 @@ class LaneSegmenter(nn.Module):
         logits = F.pixel_shuffle(self.head(x), self.shuffle)
         stride = self.config.output_stride
         return logits[..., : -(-image.shape[-2] // stride), : -(-image.shape[-1] // stride)]
+
+    def _in_order(self, image: Tensor) -> Tensor:
+        """Return images (B, C, H, W) in channels-last order, in which convolutions take less time.
+
+        Networks of other widths stay as they are: gradients of convolutions of four channels in this order
+        corrupt the memory (torch 2.13, CPU).
+        """
+        if self.config.base_width % 8 or self.config.decoder_width % 8:
+            return image
+        return image.permute(0, 2, 3, 1).contiguous().permute(0, 3, 1, 2)
 
 
 def _check_scale(image: Tensor) -> None:

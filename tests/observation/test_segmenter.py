@@ -2,7 +2,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from lanebev.observation.resnet import STRIDES, ResNet18
+from lanebev.observation.resnet import STRIDES, BasicBlock, ResNet18
 from lanebev.observation.segmenter import LaneSegmenter, SegmenterConfig, upsample_aligned
 from lanebev.weights import load_segmenter, read_metadata, save_segmenter
 from train.export import widen
@@ -50,6 +50,28 @@ def test_output_stride(output_stride, last):
 def test_any_size(stride, size):
     model = LaneSegmenter(SegmenterConfig(base_width=4, decoder_width=4, output_stride=stride)).eval()
     assert model(torch.rand(2, 3, *size)).shape == (2, 7, -(-size[0] // stride), -(-size[1] // stride))
+
+
+@pytest.mark.parametrize("stride", [1, 2])
+def test_a_block_equals_the_published_one(stride):
+    block = BasicBlock(4, 6, stride).double().eval()
+    x = torch.randn(2, 4, 9, 12, dtype=torch.float64)
+    projection, norm = block.downsample
+    identity = norm(F.conv2d(x, projection.weight, stride=stride))
+    residual = block.bn2(block.conv2(block.bn1(block.conv1(x)).relu()))
+    assert torch.allclose(block(x), (residual + identity).relu())
+
+
+def test_gradients_do_not_depend_on_the_order_of_memory():
+    segmenter = LaneSegmenter(SMALL).double().eval()
+    image = torch.rand(2, 3, 33, 64, dtype=torch.float64)
+    gradients = []
+    for order in (torch.contiguous_format, torch.channels_last):
+        segmenter.zero_grad()
+        trunk = segmenter.trunk(image.contiguous(memory_format=order))
+        sum(each.square().sum() for each in trunk).backward()
+        gradients.append([weight.grad for weight in segmenter.trunk.parameters()])
+    torch.testing.assert_close(*gradients)
 
 
 def test_convention_trunk_cells_sit_on_their_pixels():
