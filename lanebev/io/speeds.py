@@ -4,7 +4,6 @@ import csv
 import math
 import re
 from collections.abc import Mapping, Sequence
-from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
@@ -17,7 +16,6 @@ _NEAREST = 1.0  # s between a frame and the nearest speed, at most
 _FASTEST = 100.0  # m/s
 _SPEED = ("speed", "velocity", "vel", "v", "vf")  # words of a column's title
 _TIME = ("time", "timestamp", "stamp", "t")
-_LIKE_TIME = re.compile(r"time|date|stamp|sec", re.IGNORECASE)  # in a title that is none of these
 _SPEED_UNITS = {
     **dict.fromkeys(("m/s", "m/sec", "mps"), 1.0),
     **dict.fromkeys(("km/h", "kmh", "kph", "kmph", "km", "km/hr", "kmhr"), 1 / 3.6),
@@ -170,8 +168,6 @@ def _speeds_of(rows: list[list[str]]) -> Speeds:
     if titles is not None:
         speed, metres = _column(titles, _SPEED, _SPEED_UNITS)
         time, seconds = _column(titles, _TIME, _TIME_UNITS) if len(titles) > 1 else (None, 1.0)
-        if time is None and speed != 0:
-            _check_counts(titles[0], [row[0] for row in rows])
     else:
         time, speed = {1: (None, 0), 2: (0, 1)}.get(len(first), (None, None))
         seconds = metres = 1.0
@@ -188,21 +184,6 @@ def _speeds_of(rows: list[list[str]]) -> Speeds:
     if not (np.diff(times) >= 0).all():  # false on NaN
         raise ValueError("expected times that rise, got others")
     return Speeds(speeds, times)
-
-
-def _check_counts(title: str, cells: list[str]) -> None:
-    """Raise if the first column of a table without times seems to have these.
-
-    Raises:
-        ValueError: it has a title like a time's, or numbers that rise and do not count the frames.
-    """
-    numbers = [_number(cell) for cell in cells] if all(map(_is_number, cells)) else []
-    steps = {b - a for a, b in pairwise(numbers)}
-    if _LIKE_TIME.search(title) or (steps != {1.0} and min(steps, default=0.0) > 0):
-        raise ValueError(
-            f"expected a column time (s since the source's first frame), got {title}; give it that title, "
-            "or leave it out where there is a speed for each frame"
-        )
 
 
 def _number(cell: str) -> float:
