@@ -110,8 +110,6 @@ def read_camera(
     except ValueError as error:
         raise ValueError(f"camera file {path}: expected a readable camera file, got: {error}") from error
     try:
-        if said := next((said for word, said in _NOT_READ.items() if word in text), ""):
-            raise ValueError(said)
         if is_colmap(text):
             camera = checked(chosen(colmap_cameras(text), name, has_usual=False))
         elif is_kitti(text) or (kind == ".txt" and not bare and not _OF_OTHERS.search(text)):
@@ -132,7 +130,8 @@ def read_camera(
             camera = camera._replace(remark="; ".join(filter(None, (camera.remark, of_ini, of_matrix))))
         return without_lens(camera) if rectified else camera
     except ValueError as error:
-        raise ValueError(f"camera file {path}: {' '.join(str(error).split())}") from error
+        said = next((said for word, said in _NOT_READ.items() if word in text), str(error))
+        raise ValueError(f"camera file {path}: {' '.join(said.split())}") from error
 
 
 def _arrays(path: Path) -> dict[str, Any]:

@@ -25,6 +25,7 @@ _ROS_INI = re.compile(r"^\[image\]\s*$", re.MULTILINE)
 _SECTION = re.compile(r"^\[[A-Za-z]\w*\]\s*$", re.MULTILINE)  # of other programs' INI, and of TOML
 _OF_FISHEYE = 4  # coefficients
 _OF_FORMER_ROS = (5, 8)  # coefficients that its calibrator stated, and those that it wrote
+_BETWEEN_BLANKS = re.compile(r"[^\s,]+(?:,[^\s,]+)?(?:\s+[^\s,]+(?:,[^\s,]+)?)+")  # as 0,31 0,11: no list
 _AROUND_NUMBERS = re.compile(r"#.*|[\s,;\[\]()]+")
 _MOST_BARE = 1_000  # characters of a text of numbers alone
 _INI_KEYS = {
@@ -332,8 +333,11 @@ def _flat(value: Any) -> list[Any]:
 
 def _sequence(name: str, value: Any) -> list[Any]:
     """Return a list of numbers, or the words of a text, as XML has several numbers, or quotes."""
-    if isinstance(value, str) and len(words := value.strip("[] ").replace(",", " ").split()) > 1:
-        return list(words)
+    if isinstance(value, str):
+        text = value.strip("[] ")
+        words = (text if _BETWEEN_BLANKS.fullmatch(text) else text.replace(",", " ")).split()
+        if len(words) > 1:
+            return list(words)
     if not isinstance(value, list):
         raise ValueError(f"{name}: expected a list of numbers, got {shown(value)}")
     return value

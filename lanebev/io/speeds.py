@@ -25,7 +25,9 @@ _SPEED_UNITS = {
     **dict.fromkeys(("cm/s", "cm"), 0.01),
     **dict.fromkeys(("mm/s", "mm"), 0.001),
 }
-_APART = re.compile(r"\b(?:km|miles|ft|fps|cm|mm)\b(?!/)")  # in a comment, where they are units of others
+_APART = re.compile(  # in a comment, where they are units of others
+    r"\b(?<!speed )(?<!in )(?<!speed [\[(])(?:km|miles|ft|fps|cm|mm)\b(?!\s*(?:/|per\b))"
+)
 _PAIR = re.compile(r"\d+,\d+", re.ASCII)  # one number with a decimal comma, or two whole ones
 _DECIMALS = re.compile(r"-?\d+(?:,\d+)?(?:\s+-?\d+(?:,\d+)?)+", re.ASCII)
 _OF_OTHERS = {  # in titles of other columns
@@ -180,6 +182,11 @@ def _speeds_of(rows: list[list[str]]) -> Speeds:
         raise ValueError(f"expected m/s up to {_FASTEST:g}, got {fastest:g}; name another unit, as speed_kmh")
     if time is None:
         return Speeds(speeds)
+    if time == speed:
+        raise ValueError(
+            "expected a title of time and one of speed, got one title of both; write them with the separator "
+            "of the numbers, as time,speed_kmh"
+        )
     times = seconds * np.array([_number(row[time]) for row in rows])
     if not (np.diff(times) >= 0).all():  # false on NaN
         raise ValueError("expected times that rise, got others")

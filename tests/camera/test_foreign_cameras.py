@@ -659,6 +659,11 @@ def test_what_is_not_read_says_what_to_do(tmp_path, name, text, words):
         _read(tmp_path / name, text)
 
 
+def test_a_comment_on_what_is_not_read_is_a_comment(tmp_path):
+    text = "# from MappingCoefficients\n{fx: 633, fy: 633, cx: 408, cy: 245, width: 800, height: 480}\n"
+    _is(_read(tmp_path / "c.yaml", text), 633, 633, 408, 245, 800, 480)
+
+
 @pytest.mark.parametrize(
     ("name", "text"),
     [
@@ -837,6 +842,8 @@ def test_matrices_without_rows_and_other_names_of_coefficients(tmp_path, key):
     for value in (lens, [lens], {"data": lens}, str(lens), "-0.3, 0.1, 0.001, 0.002, 0.05"):
         camera = _read(tmp_path / "c.json", json.dumps({**fields, key: value}))
         _is(camera, 633, 633, 408, 245, 800, 480, lens)
+    with pytest.raises(ValueError, match="coefficients: expected finite numbers, got -0,3"):
+        _read(tmp_path / "c.json", json.dumps({**fields, key: "-0,3 0,1 0,0 0,0"}))
     with pytest.raises(ValueError, match="camera_matrix: expected 9 numbers, got 8"):
         _read(
             tmp_path / "c.json",

@@ -69,6 +69,9 @@ def test_times_and_speeds(read, text):
         "# vehicle speed log v1.0 (mm)\n10\n11\nnan\n",
         "# speed of each frame, 30 fps\n10\n11\nnan\n",
         "# speed (m/s) below 130 km/h\n10\n11\nnan\n",
+        "# speed [km per hour]\n36\n39.6\nnan\n",
+        "# vehicle speed in km / h\n36\n39.6\nnan\n",
+        "# speed (km)\n36\n39.6\nnan\n",
         "speed (km/h)\n36,0\n39,6\nnan\n",  # a decimal comma
         "# speed\n10.0\n11.0\n-1.000000e+00\n",  # of numpy.savetxt
     ],
@@ -126,6 +129,10 @@ def test_a_speed_between_two_and_beside_them():
         ("0.2,10\n0.1,11\n", "expected times that rise, got others"),
         ("nan,10\n0.1,11\n", "expected times that rise, got others"),
         ("13,88\n13,91\n", "expected rising times, got '13,88' and the like; write decimals with a point"),
+        (
+            "time,speed m/s\n0,0 12,5\n0,1 13,5\n",
+            "expected a title of time and one of speed, got one title of both",
+        ),
         (b"\x89PNG\x00\xff\xfe", "not a text file"),
     ],
 )

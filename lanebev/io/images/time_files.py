@@ -14,8 +14,9 @@ from lanebev.io.images.names import are_of_a_drive, times_of_stamps
 from lanebev.numbers import read_text
 
 _NAME = re.compile(r"(?:frame|image)?_?(?:timestamp|time)s?\.(?:txt|csv)", re.IGNORECASE)
-_DATED = re.compile(r"(\d{4})-(\d\d)-(\d\d)[T ](\d\d):(\d\d):(\d\d(?:\.\d+|,\d{3}(?!\d))?)", re.ASCII)
-_DECIMAL_COMMA = re.compile(r"\d+,\d+", re.ASCII)
+_DATED = re.compile(r"(\d{4})-(\d\d)-(\d\d)[T ](\d\d):(\d\d):(\d\d(?:\.\d+)?)", re.ASCII)
+_MILLISECONDS = re.compile(r"(?<=\d\d-\d\d[T ]\d\d:\d\d:\d\d),(?=\d{3}(?!\d))", re.ASCII)
+_DECIMAL_COMMA = re.compile(r"\d+,\d{1,9}", re.ASCII)  # more digits are a time since 1970
 _SLOWEST = 5  # s between frames of a drive; 33 between them are milliseconds
 _TITLE = re.compile(r"(?!exposure|lap).*(time(?!_?zone)|stamp)")  # of a column of times
 _NUMBER = re.compile(r"\d+(?:\.\d*)?(?:e[+-]?\d\d?)?", re.ASCII | re.IGNORECASE)
@@ -70,6 +71,8 @@ def _stamps(text: str) -> list[str]:
     wholes = [line.strip().split(",")[0] for line in rows if _DECIMAL_COMMA.fullmatch(line.strip())]
     if len(wholes) == len(rows) > len({*wholes}):  # as numbers of images they would differ
         rows = [line.replace(",", ".") for line in rows]
+    if all(map(_MILLISECONDS.search, rows[1:])):  # in some lines alone they are numbers of images
+        rows = [_MILLISECONDS.sub(".", line) for line in rows]
     found = [_stamp(line) for line in rows]
     titles = re.split(r"[\s,;]+", rows[0].strip().lower()) if rows and not found[0] else []
     named = [place for place, title in enumerate(titles) if _TITLE.match(title)]
@@ -90,7 +93,7 @@ def _stamp(line: str) -> str:
         seconds = (
             86400 * date(int(year), int(month), int(day)).toordinal() + 3600 * int(hour) + 60 * int(minute)
         )
-        return str(seconds + Fraction(second.replace(",", ".")))
+        return str(seconds + Fraction(second))
     numbers = [word for word in re.split(r"[\s,;]+", line) if _NUMBER.fullmatch(word)]
     is_number_first = len(numbers) > 1 and numbers[0].isdecimal() and len(numbers[0]) < 10
     return numbers[1 if is_number_first else 0] if numbers else ""

@@ -29,6 +29,7 @@ FILES = {
     "decimal commas": ("times.txt", [str(time).replace(".", ",") for time in TIMES]),
     "of Python's logging": ("times.txt", [f"2026-11-30 10:15:30,{1000 * time:03.0f}" for time in TIMES]),
     "with names": ("times.csv", ["#s,name", *(f"{time},{i:04d}.png" for i, time in enumerate(TIMES))]),
+    "camera and nanoseconds": ("timestamps.txt", [f"0,{each}" for each in NANOSECONDS]),
 }
 
 
@@ -52,6 +53,12 @@ def test_a_file_beside_images_has_their_times(tmp_path, name, lines):
     assert contradicted.times == ()
     words = r": a file of times beside it states 9.[67]\d+ frames per second, --fps 30 was given$"
     assert re.search(words, contradicted.problem)
+
+
+def test_numbers_of_images_after_dates_are_no_milliseconds(tmp_path):
+    folder = _images(tmp_path / "data")
+    (folder / "times.txt").write_text("".join(f"2026-11-30 10:15:{i:02d},{97 + i}\n" for i in range(6)))
+    np.testing.assert_array_equal(open_source(str(folder)).times, range(6))
 
 
 def test_of_more_times_those_of_the_images_numbers_are_taken(tmp_path):
