@@ -96,7 +96,8 @@ def test_speeds_that_do_not_fit_are_one_line(capsys, data, tmp_path):
     )
     fails(capsys, [*fixed, "--speed", tmp_path / "none.csv"], "none.csv: No such file")
     fails(capsys, [*fixed, "--speed", wrong, "--stills"], "speed: expected a drive, got --stills")
-    fails(capsys, [*fixed, "--speed-topic", "/odom"], "speed topic: expected a bag as the source, got ")
+    words = "speed topic: expected a bag as the source, got ", "; leave --speed-topic out"
+    fails(capsys, [*fixed, "--speed-topic", "/odom"], *words)
     fails(
         capsys, [*fixed, "--speed-topic", "/odom", "--speed", wrong], "expected a file or a topic, got both"
     )

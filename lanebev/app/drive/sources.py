@@ -68,7 +68,7 @@ def _stream(config: RunConfig, selection: Selection) -> FrameSource:
         if getattr(config, name):
             shown = without_login(config.source)
             option = name.replace("_", "-")
-            raise ValueError(f"source {shown}: expected no --{option} with a stream; leave it out")
+            raise ValueError(f"source {shown}: expected no --{option} with a stream, got it; leave it out")
     return open_live(config.source, config.frame_rate, config.keep_all, selection)
 
 
@@ -99,7 +99,9 @@ def _speeds(config: RunConfig, source: FrameSource) -> Speeds | None:
     """Return the speeds of the vehicle that the settings give."""
     if config.speed_topic is not None:
         if not isinstance(source, BagSource):
-            raise ValueError(f"speed topic: expected a bag as the source, got {config.source}")
+            raise ValueError(
+                f"speed topic: expected a bag as the source, got {config.source}; leave --speed-topic out"
+            )
         return bag_speeds(Path(config.source), source.topic, config.speed_topic)
     if config.speed is None:
         return None

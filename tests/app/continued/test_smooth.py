@@ -183,7 +183,7 @@ def test_what_cannot_be_smoothed_is_one_line(data, tmp_path, capsys, more, words
 def test_a_stream_has_no_second_pass(data, tmp_path, capsys):
     options = ["run", "-", "--camera", str(data / "camera.yaml"), "--smooth", "--out", str(tmp_path / "out")]
     assert main(options) == 2
-    assert "expected no --smooth with a stream" in capsys.readouterr().err
+    assert "expected no --smooth with a stream, got it; leave it out" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(("num", "kilobytes"), [(6, 8.13), (4, 6.74)])
