@@ -142,6 +142,9 @@ def _are_commas_decimal(table: list[str]) -> bool:
             "them the titles time,speed"
         )
     of_speed = "," not in table[0] and _names(table[0], _SPEED) and not _names(table[0], _TIME)
+    are_counted = [line.split(",")[0] for line in table[1:]] == [str(i) for i in range(len(table) - 1)]
+    if of_speed and (are_counted or any("." in line for line in table[1:])):  # a column without a title
+        return False
     return of_speed or _DECIMALS.fullmatch(table[-1]) is not None
 
 

@@ -116,6 +116,8 @@ def test_a_speed_between_two_and_beside_them():
             "expected one column of speed, got speed_fl, speed_fr; leave the oth",
         ),
         ("time,speed\n0,1\n1\n", "expected 2 columns as in the first line, got '1'"),
+        ("speed\n0,12\n1,13\n2,14\n", "expected 1 columns as in the first line, got '0 12'"),
+        ("speed\n0,12.5\n2,13.5\n", "expected 1 columns as in the first line, got '0 12.5'"),
         ("time,speed\n0,fast\n", "expected a number, got 'fast'"),
         ("time,angular_velocity\n0,0.1\n", ".* titles that names them, got 'time angular_velocity'"),
         ("time,speed\n10:15:30,9\n", "expected a number, got '10:15:30'; write times in seconds"),
