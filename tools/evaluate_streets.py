@@ -2,14 +2,14 @@
 
     python -m tools.evaluate_streets [--data ../shared/data] [--weights FILE] [--json FILE] [--far-view]
         [--precision bfloat16]
-    python -m tools.evaluate_streets --rendered 24 [--width 576] [--far-view]
+    python -m tools.evaluate_streets --rendered 24 [--size 720 1280] [--width 576] [--far-view]
 
 ``kitti_road``: the road plane of the lidar is the truth of pitch and roll (0.1 to 0.2 degrees), yaw has none.
 ``kitti_road_with_prior``: the same with the median of these as a mount that is known.
 ``kitti_road_standing``: each image as a drive of a second in which the car stands: the same frame 30 times.
 ``culane``: frames at night whose camera is not published; a field of view of 60 degrees is assumed, and only
 the number of calibrated frames counts. ``streets``: two images with a known pose. Nothing here is trained on.
-``--rendered``: in place of these, rendered views of all kinds of road, as wide as KITTI's images.
+``--rendered``: in place of these, rendered views of all kinds of road, of ``--size``.
 """
 
 import csv
@@ -35,7 +35,8 @@ from train.commands import one_line_errors
 
 KITTI_LANE_WIDTH = 3.5  # m
 ASSUMED_FOV = 60.0  # deg, of a camera that is not published
-RENDERED_SEED, RENDERED_ROWS, RENDERED_SIZE = 621, 8, (375, 1242)  # views at once; px, as KITTI's images
+RENDERED_SEED, RENDERED_ROWS = 621, 8  # views at once
+KITTI_SIZE = (375, 1242)  # px
 STANDING_FRAMES = 30  # of a drive in which the car stands
 MOUNT_STD = 0.001  # rad, of the median pose where it is given as a prior
 
@@ -120,18 +121,18 @@ def streets(model: LaneBEV, data: Path) -> dict[str, float]:
     return figures
 
 
-def rendered(model: LaneBEV, views: int) -> dict[str, float]:
-    """Evaluate rendered views of all kinds of road, each with the mean of its lane widths."""
+def rendered(model: LaneBEV, views: int, size: tuple[int, int] = KITTI_SIZE) -> dict[str, float]:
+    """Evaluate rendered views (height, width) of all kinds of road, each with the mean of its lane widths."""
     generator = torch.Generator().manual_seed(RENDERED_SEED)
     answers, truth = [], []
     with torch.inference_mode():
         for start in range(0, views, RENDERED_ROWS):
-            frame = render_views(min(RENDERED_ROWS, views - start), RENDERED_SIZE, generator)
+            frame = render_views(min(RENDERED_ROWS, views - start), size, generator)
             pitch, yaw, roll, _ = (part.double() for part in frame.extrinsics)
             truth.append(plane_angles(road_from_cam(pitch, yaw, roll)[:, 1]))
             for row, image in enumerate(frame.image):
                 lens = (frame.intrinsics[row].double(), frame.distortion[row].double())
-                camera = Camera(*lens, "pinhole", RENDERED_SIZE)
+                camera = Camera(*lens, "pinhole", size)
                 width = float(frame.lane_width[row].mean())
                 calibration = calibrate_frame(model, image[None], camera, width)
                 answers.append(as_answer(f"{start + row}", calibration))
@@ -147,13 +148,21 @@ def main() -> None:
         "--rendered", type=PositiveInt, metavar="N", help="evaluate on N rendered views instead"
     )
     parser.add_argument(
+        "--size",
+        type=PositiveInt,
+        nargs=2,
+        default=KITTI_SIZE,
+        metavar=("HEIGHT", "WIDTH"),
+        help="px of these (as KITTI's images)",
+    )
+    parser.add_argument(
         "--pose-sigma-scale", type=PositiveFloat, help="instead of the factor that the weights state"
     )
     options = parser.parse_args()
     model = make_model(options)
     model.pose_sigma_scale = options.pose_sigma_scale or model.pose_sigma_scale
     if options.rendered:
-        report({"rendered": rendered(model, options.rendered)}, options.json)
+        report({"rendered": rendered(model, options.rendered, tuple(options.size))}, options.json)
         return
     for name in ("kitti_road", "culane", "streets"):
         if not (options.data / name).is_dir():

@@ -79,7 +79,7 @@ def plan(cost: FrameCost, hours: float, fps: float, cores: int, minutes: float) 
 def measure(config: RunConfig, folder: Path) -> FrameCost:
     """Run on the frames of the settings, with one thread, and return what a frame takes."""
     torch.set_num_threads(1)
-    network = SharedNetwork(make_network(config.weights, config.device, config.precision))
+    network = SharedNetwork(make_network(*config.network))
     seen = folder / "seen.json"
     warm = replace(config, end=config.start + 0.5)
     observe_part(warm, folder / "warm.json", network)

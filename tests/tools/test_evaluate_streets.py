@@ -50,12 +50,11 @@ def test_the_interval_of_a_median_holds_it_19_times_in_20():
     assert median_interval(torch.tensor([[3.0], [1.0]])) == (1.0, 3.0)
 
 
-def test_rendered_views(monkeypatch):
+def test_rendered_views():
     """A network that has learned nothing sees nothing: the answer is the prior's."""
-    monkeypatch.setattr(evaluate_streets, "RENDERED_SIZE", (64, 192))
     config = SegmenterConfig(base_width=8, decoder_width=8, image_size=(64, 192))
     torch.manual_seed(1)
     model = LaneBEV(LaneSegmenter(config), LineExtractor.for_network(config), JointCalibrator()).eval()
-    figures = evaluate_streets.rendered(model, 2)
+    figures = evaluate_streets.rendered(model, 2, (64, 192))
     assert (figures["images"], figures["tracking"]) == (2, 0)
     assert figures["pitch_within_3_sigma"] == 1.0

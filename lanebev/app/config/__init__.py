@@ -9,8 +9,17 @@ from lanebev.app.config.run import (
     CALIBRATORS,
     FOV_FOCAL_STD,
     PRECISIONS,
+    NetworkSettings,
     RunConfig,
     rate_as_fraction,
 )
 
-__all__ = ["BACKENDS", "CALIBRATORS", "FOV_FOCAL_STD", "PRECISIONS", "RunConfig", "rate_as_fraction"]
+__all__ = [
+    "BACKENDS",
+    "CALIBRATORS",
+    "FOV_FOCAL_STD",
+    "PRECISIONS",
+    "NetworkSettings",
+    "RunConfig",
+    "rate_as_fraction",
+]

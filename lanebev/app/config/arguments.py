@@ -26,7 +26,7 @@ RUN_GROUPS = {
     "camera": ("camera", "fov", "focal_std", "rectified", "mount"),
     "lanes": ("lane_width", "lane_width_std", "lanes", "lanes_size", "lanes_crop"),
     "estimation": ("calibrator", "smooth", "hilly", "speed", "speed_topic", "resume"),
-    "network": ("weights", "device", "precision", "far_view", "backend", "exported"),
+    "network": ("weights", "device", "precision", "network_width", "far_view", "backend", "exported"),
     "outputs": ("out", "formats", "no_video", "grid", "rerun"),
 }
 """Groups of the options of ``run`` in its ``--help``: the fields of :class:`RunConfig`, each once."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from fractions import Fraction
+from typing import NamedTuple
 
 from lanebev.app.config.options import check_grid, check_types, option, parse_grid, parse_rate
 from lanebev.estimation.lane_width_prior import (
@@ -27,6 +28,15 @@ FOV_FOCAL_STD = 0.2
 def rate_as_fraction(fps: float | None) -> Fraction | None:
     """Return a frame rate (Hz) as a fraction, None for none."""
     return None if fps is None else Fraction(fps).limit_denominator(1000)
+
+
+class NetworkSettings(NamedTuple):
+    """Arguments of :func:`lanebev.app.drive.build.make_network`."""
+
+    weights: str | None
+    device: str
+    precision: str
+    width: int | None
 
 
 @dataclass(frozen=True)
@@ -124,6 +134,13 @@ class RunConfig:
         "processors and GPUs that have it",
         choices=PRECISIONS,
     )
+    network_width: int | None = option(
+        None,
+        "width of the network's input, pixels (default: 576 with the shipped weights, more for wide images); "
+        "the time grows with its square",
+        "PX",
+        int,
+    )
     backend: str = option(
         "torch", "library that computes network and calibrator (default {})", choices=BACKENDS
     )
@@ -165,6 +182,11 @@ class RunConfig:
         None, "topic of a bag with the vehicle's speed: Odometry, Twist, VelocityReport or GPSFix", "NAME"
     )
     hilly: bool = option(False, "expect crests and dips everywhere (default: at the start and where evident)")
+
+    @property
+    def network(self) -> NetworkSettings:
+        """The settings on which the network depends; runs that have the same can share it."""
+        return NetworkSettings(self.weights, self.device, self.precision, self.network_width)
 
     @property
     def relative_focal_std(self) -> float:
@@ -244,7 +266,9 @@ class RunConfig:
             raise ValueError(f"backend: expected {' or '.join(BACKENDS)}, got {self.backend!r}")
         if self.precision not in PRECISIONS:
             raise ValueError(f"precision: expected one of {', '.join(PRECISIONS)}, got {self.precision!r}")
-        torch_only = ("mount", "hilly", "weights")
+        if self.network_width is not None and not 64 <= self.network_width <= 4096:
+            raise ValueError(f"network width: expected 64 to 4096 px, got {self.network_width}")
+        torch_only = ("mount", "hilly", "weights", "network_width")
         given = next((name for name in torch_only if getattr(self, name)), None)
         given = given or ("device" if self.device != "cpu" else None)
         given = given or ("precision" if self.precision != "float32" else None)

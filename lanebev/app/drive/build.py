@@ -95,19 +95,22 @@ def needs_network(config: RunConfig) -> bool:
     return config.lanes is None and config.backend == "torch"
 
 
-def make_network(weights: str | None, device: str, precision: str = "float32") -> LaneBEV:
+def make_network(
+    weights: str | None, device: str, precision: str = "float32", width: int | None = None
+) -> LaneBEV:
     """Load a network, the shipped one without ``weights``, on a device.
 
     Args:
         weights: file, or None.
         device: name of the device.
         precision: number format of the convolutions, one of PRECISIONS; the rest stays in single precision.
+        width: of the network's input, px; None is that of the weights.
 
     Raises:
         ValueError: weights that do not fit the network, or a device that is not there or lacks the format.
     """
     found = usable_device(device)
-    model = LaneBEV.from_pretrained(weights).to(found)
+    model = LaneBEV.from_pretrained(weights, network_width=width).to(found)
     return with_precision(model, precision)
 
 
@@ -149,7 +152,7 @@ def make_observer(
         config: the settings.
         source: the frames.
         camera: the lens.
-        network: an already loaded network with the weights, device and precision of the settings.
+        network: an already loaded network of the settings (:attr:`RunConfig.network`).
         tracker: tracker of the same frames, on whose estimates a far view depends.
 
     Raises:
@@ -163,7 +166,7 @@ def make_observer(
     if config.backend == "onnxruntime":
         loaded: LaneBEV | SharedNetwork = onnx_model(Path(config.exported), camera, config.far_view)
     else:
-        loaded = network or make_network(config.weights, config.device, config.precision)
+        loaded = network or make_network(*config.network)
     if config.far_view and tracker is not None:
         return FarViewObserver(loaded, tracker, camera, config.stills)
     return NetworkObserver(loaded, camera)

@@ -54,7 +54,7 @@ def groups_of(tasks: Sequence[Task], batch: int) -> list[tuple[Task, ...]]:
     for task in tasks:
         config = task.config
         shares = needs_network(config) and batch > 1
-        key = (config.weights, config.device, config.precision) if shares else (task.name,)
+        key = config.network if shares else (task.name,)
         alike.setdefault(key, []).append(task)
     return [
         tuple(own[first : first + batch]) for own in alike.values() for first in range(0, len(own), batch)

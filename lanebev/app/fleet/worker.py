@@ -7,7 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache, partial
 from pathlib import Path
 
-from lanebev.app.config import RunConfig
+from lanebev.app.config import NetworkSettings, RunConfig
 from lanebev.app.continued.part_observation import observe_part
 from lanebev.app.continued.recovery import size_and_time
 from lanebev.app.drive.build import make_network, needs_network
@@ -25,7 +25,7 @@ def run_tasks(tasks: Sequence[Task]) -> list[Outcome]:
     A drive that fails has an outcome that says why, and disturbs no other.
 
     Args:
-        tasks: all with the same weights, device and precision. What is done already, by a worker that died
+        tasks: all with the same settings of the network. What is done already, by a worker that died
             later on, is not done again.
     """
     try:
@@ -71,10 +71,10 @@ def _shared_network(config: RunConfig, batch: int) -> SharedNetwork | None:
     if not needs_network(config):
         return None
     changed = size_and_time(Path(config.weights)) if config.weights else (0, 0)
-    return SharedNetwork(_loaded(config.weights, changed, config.device, config.precision), batch)
+    return SharedNetwork(_loaded(config.network, changed), batch)
 
 
 @lru_cache(maxsize=1)
-def _loaded(weights: str | None, changed: tuple[int, int], device: str, precision: str) -> LaneBEV:
-    """Return the network of some weights; ``changed`` is the file's size and time, to notice a new one."""
-    return make_network(weights, device, precision)
+def _loaded(settings: NetworkSettings, changed: tuple[int, int]) -> LaneBEV:
+    """Return a network; ``changed`` is the size and time of its weights file, to notice a new one."""
+    return make_network(*settings)

@@ -141,10 +141,11 @@ def _task(name, **settings):
 
 def test_groups_share_a_network():
     alone = [_task("b", lanes="l"), _task("c", device="cuda"), _task("h", precision="bfloat16")]
+    alone.append(_task("i", network_width=640))
     tasks = [_task("a"), *alone, *map(_task, "defg")]
     groups = [[task.name for task in group] for group in groups_of(tasks, 3)]
-    assert groups == [["a", "d", "e"], ["f", "g"], ["b"], ["c"], ["h"]]
-    assert [len(group) for group in groups_of(tasks, 1)] == [1] * 8
+    assert groups == [["a", "d", "e"], ["f", "g"], ["b"], ["c"], ["h"], ["i"]]
+    assert [len(group) for group in groups_of(tasks, 1)] == [1] * 9
 
 
 class _RayError(Exception):
