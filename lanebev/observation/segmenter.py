@@ -136,7 +136,8 @@ class LaneSegmenter(nn.Module):
         x = F.relu(self.norm(self.refine(F.relu(x))))
         logits = F.pixel_shuffle(self.head(x), self.shuffle)
         stride = self.config.output_stride
-        return logits[..., : -(-image.shape[-2] // stride), : -(-image.shape[-1] // stride)]
+        cropped = logits[..., : -(-image.shape[-2] // stride), : -(-image.shape[-1] // stride)]
+        return cropped.contiguous()
 
     def _in_order(self, image: Tensor) -> Tensor:
         """Return images (B, C, H, W) in channels-last order, in which convolutions take less time.

@@ -62,6 +62,10 @@ def test_a_block_equals_the_published_one(stride):
     assert torch.allclose(block(x), (residual + identity).relu())
 
 
+def test_logits_are_in_the_usual_order(small):
+    assert small(torch.rand(2, 3, 33, 64)).view(2, -1).shape == (2, 7 * 17 * 32)
+
+
 def test_gradients_do_not_depend_on_the_order_of_memory():
     segmenter = LaneSegmenter(SMALL).double().eval()
     image = torch.rand(2, 3, 33, 64, dtype=torch.float64)

@@ -352,7 +352,9 @@ def test_states_that_were_stacked_or_cast_as_a_whole_are_named(calibrator):
     ):
         calibrator(segments, K.expand(2, 3, 3), stacked, 1 / 30)
     cast = type(state)(*(part.double() for part in state))
-    with pytest.raises(ValueError, match=r"state.status: expected int64, got torch.float64; cast only floating-point tensors"):
+    with pytest.raises(
+        ValueError, match=r"state.status: expected int64, got torch.float64; cast only floating-point tensors"
+    ):
         calibrator(lanes(seed=0), K[None], cast, 1 / 30)
     joined = type(state)(*map(torch.cat, zip(state, state, strict=True)))
     found, _ = calibrator(segments, K.expand(2, 3, 3), joined, 1 / 30)
