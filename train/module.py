@@ -92,10 +92,7 @@ class Segmentation(L.LightningModule):
         network = network or SegmenterConfig()
         given = locals()
         self.settings = {"network": asdict(network), **{name: given[name] for name in _SETTINGS}}
-        # torch 2.13 corrupts memory in the backward pass of channels-last convolutions of 4 channels
-        self.layout = torch.channels_last if network.base_width % 8 == 0 else torch.contiguous_format
         self.segmenter = LaneSegmenter(network)
-        self.segmenter.to(memory_format=self.layout)  # type: ignore[call-overload]  # torch declares it not
         weights = torch.tensor(class_weight or [1.0] * (1 + network.num_boundaries))
         if weights.numel() != 1 + network.num_boundaries:
             raise ValueError(
@@ -157,7 +154,7 @@ class Segmentation(L.LightningModule):
         if self.photometric is not None:
             with torch.no_grad(), self._own_randomness(batch_idx):
                 image = self.photometric(image)
-        logits = self.segmenter(image.contiguous(memory_format=self.layout)).float()  # sums need it
+        logits = self.segmenter(image).float()  # sums need it
         pixels = boundary_cross_entropy(logits, target, weight, self.class_weight)
         rows = row_cross_entropy(logits, target, weight)
         self.log_dict({"loss/pixels": pixels.detach(), "loss/rows": rows.detach()}, prog_bar=True)

@@ -147,6 +147,7 @@ class LaneSegmenter(nn.Module):
         """
         if self.config.base_width % 8 or self.config.decoder_width % 8:
             return image
+        # contiguous(memory_format=...) does not work in torch.vmap
         return image.permute(0, 2, 3, 1).contiguous().permute(0, 3, 1, 2)
 
 

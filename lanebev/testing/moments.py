@@ -36,9 +36,7 @@ class Moment:
     wander: Callable[[Tensor], Tensor] | None = None  # of Z (G,): boundaries beside their places (6, G) m
     curvature: Callable[[Tensor], Tensor] | None = None  # of Z ahead, 1/m
     profile: float = 0.0  # 1/m, vertical curvature of the road, positive over a crest
-    crossfall: Callable[[Tensor], Tensor] | None = (
-        None  # of Z (..., ): slope to the right less that at the camera
-    )
+    crossfall: Callable[[Tensor], Tensor] | None = None  # of Z: slope down to the right, less that at 0
     visible: tuple[int, ...] = (0, 1, 2, 3, 4, 5)
     shift: int = 0  # wrong numbering of the whole frame
     near: float = 3.5

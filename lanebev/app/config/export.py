@@ -44,7 +44,8 @@ class ExportConfig:
         if not self.camera:
             raise ValueError("camera: expected --camera FILE, got none")
         if self.int8 and (self.format != "onnx" or "segmenter" not in self.parts):
-            raise ValueError("int8: expected --format onnx and the part segmenter, got other ones")
+            got = f"--format {self.format} and {self.part or 'all parts'}"
+            raise ValueError(f"int8: expected --format onnx and the part segmenter, got {got}")
         if self.far_view and self.part in ("extractor", "warp"):
             raise ValueError(
                 f"part: expected segmenter, {', '.join(CALIBRATORS)} or step with --far-view, "
