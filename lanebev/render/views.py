@@ -13,11 +13,17 @@ from lanebev.render.raster.base.features import features_of
 from lanebev.render.raster.paint import paint_view, prepare
 from lanebev.render.raster.sensor.sensor import take_image
 from lanebev.render.rows import send, take_rows
-from lanebev.render.scene.camera.lens import Lens, sample_distortion, sample_extrinsics, sample_intrinsics
+from lanebev.render.scene.camera.lens import (
+    Lens,
+    sample_distortion,
+    sample_extrinsics,
+    sample_intrinsics,
+    varied_extrinsics,
+    varied_intrinsics,
+)
 from lanebev.render.scene.camera.window import WindowConfig, sample_window_scale, window_from_native
 from lanebev.render.scene.road.alignment import build_alignment
 from lanebev.render.scene.sampler import BatchSampler
-from lanebev.render.scene.varied import varied_extrinsics, varied_intrinsics
 from lanebev.render.scene.world import Place, Scene, World, moved_along, sample_course, sample_world, scene_at
 from lanebev.render.truth import frame_truth
 from lanebev.tensors import one_thread

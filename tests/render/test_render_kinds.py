@@ -22,9 +22,8 @@ from lanebev.render.scene.kinds import KINDS, sample_kinds
 from lanebev.render.scene.light.night import sample_lights
 from lanebev.render.scene.light.weather import Light
 from lanebev.render.scene.objects.traffic import NUM_VEHICLES
-from lanebev.render.scene.places.street import PLAIN, no_street
+from lanebev.render.scene.places.street import AHEAD, CROSS, LEFT, NUM_GLYPHS, PLAIN, RIGHT, no_street
 from lanebev.render.scene.road.alignment import arc_nodes, build_alignment
-from lanebev.render.scene.road.glyphs import AHEAD, CROSS, LEFT, NUM_GLYPHS, RIGHT
 from lanebev.render.scene.road.layout import presence
 from lanebev.render.scene.sampler import BatchSampler
 from lanebev.render.scene.world import Place, World, sample_course, sample_world, scene_at

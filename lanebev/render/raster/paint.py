@@ -1,5 +1,6 @@
 """Linear radiance of every pixel: sky, ground, walls, objects, in the order of their distance."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -23,6 +24,9 @@ from lanebev.render.scene.road.alignment import ground_hit, lowest_slopes
 from lanebev.render.scene.world import Scene
 
 _METERED = 40.0  # m of road by which the exposure is set
+
+Effect = Callable[[Scene, View, Tensor, Tensor], Tensor]
+"""Of scenes, rays, radiance (B, 3, H, W) and blocked (B, H, W), to the radiance."""
 
 
 class Prepared(NamedTuple):
@@ -73,8 +77,8 @@ def paint_view(scene: Scene, prepared: Prepared, size: tuple[int, int], features
     add_objects(scene, view, prepared.solids, canvas)
     shape = (len(lowest), *view.size)
     radiance, blocked = canvas.radiance.view(3, *shape).transpose(0, 1), canvas.blocked.view(shape)
-    _add_tunnels(scene, view, radiance, blocked, features.rows.tunnel)
-    _add_lights(scene, view, radiance, blocked, features.rows.night)
+    _change_rows(scene, view, radiance, blocked, features.rows.tunnel, _with_ceiling)
+    _change_rows(scene, view, radiance, blocked, features.rows.night, _with_lights)
     return Painted(
         radiance=radiance,
         blocked=blocked,
@@ -105,29 +109,29 @@ def _add_ground(
     return ground, lit
 
 
-def _add_tunnels(scene: Scene, view: View, radiance: Tensor, blocked: Tensor, rows: list[int]) -> None:
-    """Put ceilings in the place of the sky on some rows; changes radiance."""
+def _change_rows(
+    scene: Scene, view: View, radiance: Tensor, blocked: Tensor, rows: list[int], effect: Effect
+) -> None:
+    """Change the radiance of some rows by an effect of their scenes and pixels."""
     if not rows:
         return
     index = torch.tensor(rows).to(radiance.device, non_blocking=True)
-    tunnel, lens = take_rows(scene.world.tunnel, index), take_rows(scene.lens, index)
-    place, alignment = take_rows(scene.place, index), take_rows(scene.alignment, index)
     own = view._replace(ray_x=view.ray_x.index_select(0, index), ray_y=view.ray_y.index_select(0, index))
     under, hidden = radiance.index_select(0, index), blocked.index_select(0, index)
-    radiance.index_copy_(0, index, add_ceiling(under, hidden, tunnel, place, alignment, lens, own))
+    radiance.index_copy_(0, index, effect(take_rows(scene, index), own, under, hidden))
 
 
-def _add_lights(scene: Scene, view: View, radiance: Tensor, blocked: Tensor, rows: list[int]) -> None:
-    """Put lights of the night, their glare and their mirror images in on some rows; changes radiance."""
-    if not rows:
-        return
-    index = torch.tensor(rows).to(radiance.device, non_blocking=True)
-    lights, lens = take_rows(scene.world.lights, index), take_rows(scene.lens, index)
-    place, alignment = take_rows(scene.place, index), take_rows(scene.alignment, index)
-    shining = sprites(lights, place, alignment, lens, take_rows(scene.objects, index))
-    own = view._replace(ray_x=view.ray_x.index_select(0, index), ray_y=view.ray_y.index_select(0, index))
-    under, hidden = radiance.index_select(0, index), blocked.index_select(0, index)
-    radiance.index_copy_(0, index, add_lights(under, hidden, lights, shining, lens, own))
+def _with_ceiling(scene: Scene, view: View, radiance: Tensor, blocked: Tensor) -> Tensor:
+    """Put the ceilings of tunnels in the place of the sky."""
+    tunnel, lens = scene.world.tunnel, scene.lens
+    return add_ceiling(radiance, blocked, tunnel, scene.place, scene.alignment, lens, view)
+
+
+def _with_lights(scene: Scene, view: View, radiance: Tensor, blocked: Tensor) -> Tensor:
+    """Put in lights of the night, their glare and their mirror images."""
+    lights, lens = scene.world.lights, scene.lens
+    shining = sprites(lights, scene.place, scene.alignment, lens, scene.objects)
+    return add_lights(radiance, blocked, lights, shining, lens, view)
 
 
 def _road_level(scene: Scene, below: Blocks, ground: Ground, lit: Tensor) -> Tensor:

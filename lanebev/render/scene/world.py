@@ -9,7 +9,7 @@ from torch import Tensor
 from lanebev.batch import select_rows
 from lanebev.render.scene.camera.glass import Glass, sample_glass
 from lanebev.render.scene.camera.lens import Lens
-from lanebev.render.scene.camera.sensor import Sensor, sample_sensor
+from lanebev.render.scene.camera.sensor import Sensor, sample_sensor, varied_camera
 from lanebev.render.scene.kinds import Kinds, sample_kinds
 from lanebev.render.scene.light.night import Lights, night_light, sample_lights
 from lanebev.render.scene.light.weather import (
@@ -21,6 +21,7 @@ from lanebev.render.scene.light.weather import (
     Weather,
     light_of,
     sample_weather,
+    varied_weather,
 )
 from lanebev.render.scene.objects.objects import SceneObjects
 from lanebev.render.scene.objects.surroundings import Surroundings, sample_surroundings
@@ -48,7 +49,6 @@ from lanebev.render.scene.road.city_layout import sample_city_layout
 from lanebev.render.scene.road.layout import Layout, sample_layout
 from lanebev.render.scene.road.pavement import Pavement, sample_pavement
 from lanebev.render.scene.sampler import BatchSampler
-from lanebev.render.scene.varied import varied_camera, varied_weather
 
 
 class World(NamedTuple):

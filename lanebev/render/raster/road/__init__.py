@@ -1,5 +1,5 @@
 """The ground.
 
-``ground`` puts together the ``surface``, its ``markings`` and ``symbols``, the ``verge``, and ``varied``
-kinds of road: a ``street`` with ``street_surface``, ``roadside`` and painted ``glyphs``, and ``winter``.
+``ground`` puts together the ``surface``, its ``markings`` and ``symbols``, the ``verge``, and what only some
+kinds of road have: a ``street`` with ``street_surface``, ``roadside`` and ``glyphs``; ``winter``; ``works``.
 """

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from lanebev.render.raster.base.select import indices_where, put, take
-from lanebev.render.scene.road.glyphs import TEXTS
+from lanebev.render.scene.places.street import TEXTS
 
 GLYPH_LENGTH, GLYPH_WIDTH = 5.0, 2.0  # m of a picture along and across the road
 _ROWS, _COLUMNS, _FINE = 200, 80, 4  # texels of 2.5 cm, drawn four times finer

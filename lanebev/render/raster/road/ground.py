@@ -14,10 +14,13 @@ from lanebev.render.raster.base.select import lines_of, put, take, take_channels
 from lanebev.render.raster.light.night import night_irradiance
 from lanebev.render.raster.light.shadows import shadows
 from lanebev.render.raster.road.markings import near_marking, paint
+from lanebev.render.raster.road.roadside import add_roadside
+from lanebev.render.raster.road.street import add_street
 from lanebev.render.raster.road.surface import LanePlace, pavement_albedo, place_in_lanes
 from lanebev.render.raster.road.symbols import symbols
-from lanebev.render.raster.road.varied import add_roadside, add_street, snow_ground, works_ground
 from lanebev.render.raster.road.verge import verge_albedo
+from lanebev.render.raster.road.winter import snow_ground
+from lanebev.render.raster.road.works import works_ground
 from lanebev.render.rows import take_rows
 from lanebev.render.scene.world import Scene
 

@@ -3,11 +3,40 @@
 import torch
 from torch import Tensor
 
+from lanebev.render.raster.base.blocks import make_blocks
 from lanebev.render.raster.base.coverage import band, beyond, dash_coverage, stripe_coverage
 from lanebev.render.raster.base.footprint import Ground
 from lanebev.render.raster.base.noise import CLOUD, hash01, sample_grain, sample_noise, smoothstep
+from lanebev.render.raster.base.select import put, take, take_channels
+from lanebev.render.rows import take_rows
 from lanebev.render.scene.places.street import GREEN, KERB, PATH, WALK, Street
 from lanebev.render.scene.road.pavement import Pavement
+from lanebev.render.scene.world import Scene
+
+
+def add_roadside(scene: Scene, row: Tensor, ground: Ground, paved: Tensor, albedo: Tensor) -> None:
+    """Put what is beside streets over a plain verge; changes the linear reflectance (3, T, N).
+
+    Args:
+        scene: B of them.
+        row: (T,) int64, not decreasing, the scene of each line of points.
+        ground: (T, N) points.
+        paved: (T, N) share of the pixel on the carriageway.
+        albedo: linear reflectance of the plain road and its verge.
+    """
+    beside = make_blocks(paved < 1, row=row, num_rows=len(scene.place.along))
+    own = beside.row
+    colours, share = roadside(
+        take_rows(scene.world.street, own),
+        take_rows(scene.world.pavement, own),
+        Ground(*(take(t, beside.place) for t in ground)),
+        scene.place.across[own],
+        scene.lens.extrinsics.height[own],
+    )
+    planes = albedo.view(3, -1)
+    under = take_channels(planes, beside.place)
+    share = share * (1 - take(paved, beside.place))
+    put(planes, beside.place, under + (colours.transpose(0, 1) - under) * share)
 
 
 def roadside(

@@ -1,19 +1,85 @@
-"""Paint on a street that bounds no lane: arrows, hatching, stop lines, crossings, bays."""
+"""The ground of a city street, and the paint on it that bounds no lane: arrows, hatching, crossings, bays."""
 
 import torch
 from torch import Tensor
 
+from lanebev.render.raster.base.blocks import make_blocks
 from lanebev.render.raster.base.coverage import band, dash_coverage, stripe_coverage
 from lanebev.render.raster.base.footprint import Ground
 from lanebev.render.raster.base.noise import hash01, sample_grain, smoothstep
+from lanebev.render.raster.base.select import put, take, take_channels
 from lanebev.render.raster.road.glyphs import GLYPH_LENGTH, GLYPH_WIDTH, glyph_coverage
 from lanebev.render.raster.road.roadside import junction_coverage
-from lanebev.render.raster.road.street_surface import strips_between
+from lanebev.render.raster.road.street_surface import ironwork, strips, strips_between, tracks
 from lanebev.render.raster.road.surface import count_below
-from lanebev.render.scene.places.street import CYCLING, FORD, PARKING, ZEBRA, Street
-from lanebev.render.scene.road.glyphs import BICYCLE, NUM_GLYPHS
+from lanebev.render.rows import take_rows
+from lanebev.render.scene.places.street import BICYCLE, CYCLING, FORD, NUM_GLYPHS, PARKING, ZEBRA, Street
 from lanebev.render.scene.road.layout import MAX_BOUNDARIES, Layout
 from lanebev.render.scene.road.pavement import Pavement
+from lanebev.render.scene.world import Scene
+
+
+def add_street(
+    scene: Scene, row: Tensor, ground: Ground, paved: Tensor, albedo: Tensor, painted: Tensor, blotch: Tensor
+) -> None:
+    """Put what is on streets over plain roads; changes the linear reflectance and the coverage by paint.
+
+    Args:
+        scene: B of them.
+        row: (T,) int64, not decreasing, the scene of each line of points.
+        ground: (T, N) points.
+        paved: (T, N) share of the pixel on the carriageway.
+        albedo: (3, T, N) linear reflectance of the plain road.
+        painted: (T, N) share of the pixel under the boundaries' paint.
+        blotch: (T, N) slow noise.
+    """
+    road = make_blocks(paved > 0, row=row, num_rows=len(scene.place.along))
+    world, place = scene.world, road.place
+    planes = albedo.view(3, -1)
+    base, covered = city_ground(
+        take_rows(world.street, road.row),
+        take_rows(world.layout, road.row),
+        take_rows(world.pavement, road.row),
+        Ground(*(take(t, place) for t in ground)),
+        take_channels(planes, place).transpose(0, 1),
+        take(painted, place),
+        take(blotch, place),
+    )
+    put(planes, place, base.transpose(0, 1))
+    put(painted.view(1, -1), place, covered[None])
+
+
+def city_ground(
+    street: Street,
+    layout: Layout,
+    pavement: Pavement,
+    ground: Ground,
+    albedo: Tensor,
+    painted: Tensor,
+    blotch: Tensor,
+) -> tuple[Tensor, Tensor]:
+    """Put what is on a street over a plain road.
+
+    Args:
+        street: what it has.
+        layout: its boundaries.
+        pavement: its edges.
+        ground: (B, N) points.
+        albedo: (B, 3, N) linear reflectance of the plain road and of what is beside it.
+        painted: (B, N) share of the pixel under the boundaries' paint.
+        blotch: (B, N) slow noise.
+
+    Returns:
+        albedo and painted of the street.
+    """
+    coloured = strips(street, layout, pavement, ground.across, ground.reach_across, albedo)
+    albedo = albedo + (coloured - albedo) * (1 - painted)[:, None]
+    lane, inside, _, on_lane = lane_coordinates(layout, ground.across)
+    dark = ironwork(street, ground, lane, inside) * on_lane * (1 - painted)
+    albedo = tracks(street, ground, albedo * (1 - dark)[:, None])
+    marks = street_paint(street, layout, pavement, ground, blotch)
+    albedo = albedo + (street.paint[..., None] - albedo) * marks[:, None]
+    return albedo, torch.maximum(painted, marks)
 
 
 def street_paint(

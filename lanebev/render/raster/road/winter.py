@@ -46,3 +46,20 @@ def snow_cover(winter: Winter, layout: Layout, pavement: Pavement, ground: Groun
     bare = 1 - here * smoothstep(0.55, 0.3, distance)  # wind and salt keep what is labelled in sight
     cover = torch.maximum(edge, torch.maximum(ridge, film)) * bare
     return (cover * (0.9 + 0.15 * grain)).clamp(0, 1) * winter.on[:, None]
+
+
+def snow_ground(
+    winter: Winter,
+    layout: Layout,
+    pavement: Pavement,
+    ground: Ground,
+    albedo: Tensor,
+    paved: Tensor,
+    painted: Tensor,
+    blotch: Tensor,
+) -> tuple[Tensor, Tensor]:
+    """Put snow on the ground; arguments as of :func:`~lanebev.render.raster.road.street.city_ground`."""
+    cover = snow_cover(winter, layout, pavement, ground, blotch)
+    field = winter.on[:, None] * winter.verge[:, None] * (1 - paved)
+    cover = torch.maximum(cover * paved, field * (0.85 + 0.15 * blotch).clamp(0, 1))
+    return albedo + (winter.colour[..., None] - albedo) * cover[:, None], painted * (1 - cover)

@@ -8,7 +8,6 @@ from torch import Tensor
 from lanebev.render.raster.base.noise import CLOUD, sample_noise
 from lanebev.render.raster.base.select import as_float
 from lanebev.render.raster.sensor.filters import blur_reach, gaussian_blur
-from lanebev.render.raster.sensor.randomness import uniform_rows
 from lanebev.render.scene.camera.sensor import Sensor
 from lanebev.render.scene.light.weather import Light
 
@@ -111,3 +110,13 @@ def _drops(wet: Tensor, draw: Tensor, size: tuple[int, int]) -> Tensor:
     mask.scatter_reduce_(1, place.long().flatten(1), as_float(on).flatten(1), "amax")
     drops: Tensor = mask.unflatten(1, size)
     return drops
+
+
+def uniform_rows(
+    shape: tuple[int, ...], generators: Sequence[torch.Generator], device: torch.device
+) -> Tensor:
+    """Draw (R, *shape) uniform values in [0, 1) on the device, which is the generators'."""
+    values = torch.empty(len(generators), *shape, device=device)
+    for row, generator in zip(values, generators, strict=True):
+        row.uniform_(generator=generator)
+    return values

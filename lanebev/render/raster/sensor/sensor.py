@@ -12,7 +12,6 @@ from lanebev.render.raster.sensor.exposure import expose
 from lanebev.render.raster.sensor.filters import blur_reach, gaussian_blur
 from lanebev.render.raster.sensor.glass import behind_glass, frame_cover, recorded, shaken
 from lanebev.render.raster.sensor.jpeg import compress
-from lanebev.render.raster.sensor.randomness import normal_rows
 from lanebev.render.rows import take_rows
 from lanebev.render.scene.camera.sensor import Sensor
 from lanebev.render.scene.world import Scene
@@ -95,6 +94,16 @@ def _blur(image: Tensor, std: Tensor) -> None:
         reach = [blur_reach(each) for each in most.tolist()]
         own = most.to(image.device, non_blocking=True)
         image.index_copy_(0, rows, gaussian_blur(image.index_select(0, rows), own, reach))
+
+
+def normal_rows(
+    shape: tuple[int, ...], generators: Sequence[torch.Generator], device: torch.device
+) -> Tensor:
+    """Draw (R, *shape) standard normal values on the device, which is the generators'."""
+    values = torch.empty(len(generators), *shape, device=device)
+    for row, generator in zip(values, generators, strict=True):
+        row.normal_(generator=generator)
+    return values
 
 
 def add_noise(image: Tensor, sensor: Sensor, generators: Sequence[torch.Generator]) -> Tensor:

@@ -104,3 +104,21 @@ def sample_extrinsics(sampler: BatchSampler) -> Extrinsics:
     roll = mixed(1.0, 4.0, 22.0, 0.08)
     height = sampler.either(0.65, (1.15, 1.75), (1.0, 2.3))
     return Extrinsics(pitch, yaw, roll, height)
+
+
+def varied_extrinsics(sampler: BatchSampler, camera: Tensor, pose: Extrinsics) -> Extrinsics:
+    """Sample heights of lorries and of low cars where a world has an unusual camera, (B,) bool."""
+    height = torch.where(sampler.chance(0.5), sampler.uniform(1.7, 3.0), pose.height)
+    return pose._replace(height=torch.where(camera, height, pose.height))
+
+
+def varied_intrinsics(
+    sampler: BatchSampler, camera: Tensor, intrinsics: Tensor, size: tuple[int, int]
+) -> Tensor:
+    """Sample wide lenses (B, 3, 3) where a world has an unusual camera, (B,) bool."""
+    view = sampler.uniform(70, 110).deg2rad()
+    wide = camera & sampler.chance(0.4)
+    factor = torch.where(wide, 0.5 * size[1] / (0.5 * view).tan() / intrinsics[:, 0, 0], 1.0)
+    scale = torch.stack([factor, factor, torch.ones_like(factor)], dim=1)
+    focal = torch.diag_embed(intrinsics.diagonal(dim1=1, dim2=2) * (scale - 1))
+    return intrinsics + focal

@@ -5,6 +5,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from lanebev.render.scene.kinds import Kinds
 from lanebev.render.scene.light.weather import DUSK, NIGHT, Weather
 from lanebev.render.scene.sampler import BatchSampler
 
@@ -79,4 +80,37 @@ def sample_sensor(sampler: BatchSampler, weather: Weather, bright: Tensor) -> Se
         bonnet_tilt=torch.zeros_like(exposure),
         bonnet_ridge=torch.zeros_like(exposure),
         bonnet_mirror=torch.zeros_like(exposure),
+    )
+
+
+def varied_camera(sampler: BatchSampler, kinds: Kinds, sensor: Sensor) -> Sensor:
+    """Change cameras: noisier and darker at night, worse where a world has a bad camera."""
+    night, camera = kinds.night, kinds.camera
+    exposure = torch.where(night, sampler.uniform(0.02, 0.22), sensor.exposure)
+    over = torch.where(camera & sampler.chance(0.15), sampler.uniform(1.3, 3.0), 1.0)
+    cast = (1 + sampler.normal(0.12, 3) * sampler.chance(0.4, 1)).clamp(0.6, 1.5)
+    noisy = torch.where(night, sampler.uniform(0.5, 2.5), 1.0)
+    noisy = noisy * torch.where(camera & sampler.chance(0.3), sampler.uniform(1.0, 3.0), 1.0)
+    crude = camera & sampler.chance(0.35)
+    bonnet = torch.where(sampler.chance(0.5), sampler.uniform(0.03, 0.28), sensor.bonnet)
+    bonnet = torch.where(night & sampler.chance(0.2), sampler.uniform(0.2, 0.4), bonnet)
+    soft = camera & sampler.chance(0.3)
+    return sensor._replace(
+        exposure=exposure * over,
+        tint=torch.where((camera | night)[:, None], sensor.tint * cast, sensor.tint),
+        read_noise=sensor.read_noise * noisy,
+        shot_noise=sensor.shot_noise * noisy,
+        blur=torch.where(soft, sampler.uniform(0.8, 2.6), sensor.blur),
+        bloom=torch.where(night, sampler.uniform(0.0, 0.5), sensor.bloom),
+        jpeg=torch.where(crude, sampler.uniform(6, 35), sensor.jpeg),
+        bonnet=torch.where(camera | night, bonnet, sensor.bonnet),
+        bonnet_tilt=torch.where(camera & sampler.chance(0.5), sampler.normal(0.04), sensor.bonnet_tilt),
+        bonnet_ridge=torch.where(
+            camera & sampler.chance(0.5), sampler.uniform(-0.8, 0.8), sensor.bonnet_ridge
+        ),
+        bonnet_mirror=torch.where(
+            (camera | night) & sampler.chance(0.6), sampler.uniform(0.05, 0.6), sensor.bonnet_mirror
+        ),
+        bonnet_bow=torch.where(camera | night, sampler.uniform(0.0, 0.3), sensor.bonnet_bow),
+        glare=torch.where(camera & sampler.chance(0.3), sampler.uniform(0.0, 0.6), sensor.glare),
     )

@@ -5,6 +5,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from lanebev.render.scene.kinds import Kinds
 from lanebev.render.scene.sampler import BatchSampler
 
 CLEAR, OVERCAST, DUSK, NIGHT, RAIN = range(5)
@@ -62,6 +63,20 @@ def sample_weather(sampler: BatchSampler) -> Weather:
         visibility=torch.where(hazy, sampler.uniform(150, 600), sampler.uniform(600, 4000)),
         sun_azimuth=sampler.uniform(-3.1416, 3.1416),
         sun_height=torch.where(dusk, sampler.uniform(0.03, 0.2), sampler.uniform(0.3, 1.3)),
+    )
+
+
+def varied_weather(sampler: BatchSampler, kinds: Kinds, weather: Weather) -> Weather:
+    """Change the weather of nights (at times a wet road), of snow (dull days) and of tunnels (clear air)."""
+    wet = sampler.sometimes(0.3, 0.1, 1.0)
+    night = kinds.night
+    dull = kinds.snow & sampler.chance(0.7)
+    visibility = torch.where(kinds.tunnel, 1e4, weather.visibility)
+    return weather._replace(
+        grey=torch.where(dull, sampler.uniform(0.5, 1.0), weather.grey),
+        kind=torch.where(night, NIGHT, weather.kind),
+        wet=torch.where(night, wet, weather.wet),
+        visibility=torch.where(night, visibility.clamp(min=300.0), visibility),
     )
 
 

@@ -6,13 +6,19 @@ import torch
 from torch import Tensor
 
 from lanebev.render.scene.objects.surroundings import GREENS
-from lanebev.render.scene.road.glyphs import ARROWS, BICYCLE, CROSS, WORDS
 from lanebev.render.scene.road.layout import MAX_BOUNDARIES, WHITE, Layout
 from lanebev.render.scene.sampler import BatchSampler
 
 PLAIN, PARKING, CYCLING = range(3)  # strips between the outer boundary and the kerb
 NO_CROSSING, ZEBRA, FORD = range(3)  # a ford: two dashed lines
 KERB, GREEN, PATH, WALK = range(4)  # strips from the kerb outwards
+# what is painted in lanes: arrows, signs and words
+AHEAD, AHEAD_SLIM, LEFT, RIGHT, AHEAD_LEFT, AHEAD_RIGHT, LEFT_RIGHT, MERGE_LEFT, MERGE_RIGHT = range(9)
+ARROWS = (AHEAD, AHEAD_SLIM, LEFT, RIGHT, AHEAD_LEFT, AHEAD_RIGHT, LEFT_RIGHT, MERGE_LEFT, MERGE_RIGHT)
+TEETH, BICYCLE, DIAMOND, CROSS = range(9, 13)
+TEXTS = ("BUS", "30", "50", "STOP", "SLOW", "P", "TAXI", "SCHOOL")
+WORDS = tuple(range(13, 13 + len(TEXTS)))
+NUM_GLYPHS = 13 + len(TEXTS)
 
 
 class Street(NamedTuple):

@@ -1,1 +1,1 @@
-"""The road: ``alignment``, ``layout`` of the boundaries (``city_layout``), ``pavement``, ``glyphs`` on it."""
+"""The road: ``alignment``, ``layout`` of the boundaries (``city_layout``) and ``pavement``."""

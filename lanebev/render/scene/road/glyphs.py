@@ -1,8 +1,0 @@
-"""The arrows, words and signs that can be painted in lanes."""
-
-AHEAD, AHEAD_SLIM, LEFT, RIGHT, AHEAD_LEFT, AHEAD_RIGHT, LEFT_RIGHT, MERGE_LEFT, MERGE_RIGHT = range(9)
-ARROWS = (AHEAD, AHEAD_SLIM, LEFT, RIGHT, AHEAD_LEFT, AHEAD_RIGHT, LEFT_RIGHT, MERGE_LEFT, MERGE_RIGHT)
-TEETH, BICYCLE, DIAMOND, CROSS = range(9, 13)
-TEXTS = ("BUS", "30", "50", "STOP", "SLOW", "P", "TAXI", "SCHOOL")
-WORDS = tuple(range(13, 13 + len(TEXTS)))
-NUM_GLYPHS = 13 + len(TEXTS)
