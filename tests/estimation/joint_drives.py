@@ -1,11 +1,16 @@
-"""Short drives and how the joint calibrator follows them, for several test files."""
+"""Short drives and how a calibrator follows them, for several test files."""
+
+from typing import Any, NamedTuple
 
 import torch
+from torch import Tensor
 
+from lanebev.estimation.joint.calibrator import JointCalibrator
 from lanebev.estimation.joint.layout import layout
 from lanebev.observation.segments import LaneSegments
-from lanebev.testing.moments import CAMERA, FPS, WIDTH, moments
+from lanebev.testing.moments import CAMERA, FPS, WIDTH, Moment, moments
 from lanebev.testing.moments import observe as see
+from lanebev.types import Calibration
 
 DOUBLE = torch.float64
 PLACE = layout(6)
@@ -27,6 +32,43 @@ def run(calibrator, frames, state=None, dt=1 / FPS):
     for _, segments in frames:
         out, state = calibrator(segments, cameras(rows), state, dt, WIDTH)
     return out, state
+
+
+class Followed(NamedTuple):
+    """One frame of a drive, and what a calibrator made of it."""
+
+    moment: Moment
+    segments: LaneSegments
+    calibration: Calibration
+    state: Any
+
+    @property
+    def error(self) -> Tensor:
+        """(R, 4) rad and m."""
+        return self.calibration.extrinsics.stack() - torch.tensor(self.moment.pose, dtype=DOUBLE)
+
+    @property
+    def sigma(self) -> Tensor:
+        """(R, 4) standard deviations of the pose."""
+        return self.calibration.covariance.diagonal(dim1=1, dim2=2).sqrt()
+
+
+@torch.inference_mode()
+def follow(
+    drive: list[Moment],
+    calibrator=None,
+    rows: int = 1,
+    sigma: float = 1.0,
+    per_boundary: int = 20,
+    seed: int = 0,
+) -> list[Followed]:
+    """Run a calibrator, the joint one by default, over a drive; each row has its own noise."""
+    calibrator = calibrator or JointCalibrator()
+    state, followed = calibrator.initial_state(rows, dtype=DOUBLE), []
+    for moment, segments in see(drive, rows, sigma, per_boundary, seed, DOUBLE):
+        calibration, state = calibrator(segments, cameras(rows), state, moment.dt, WIDTH)
+        followed.append(Followed(moment, segments, calibration, state))
+    return followed
 
 
 def nothing(segments: LaneSegments) -> LaneSegments:

@@ -20,6 +20,7 @@ from lanebev.testing.experiment import Experiment
 from lanebev.testing.moments import CAMERA, PLACES, WIDTH, Moment, curves, moments, observe
 from lanebev.testing.scenarios import SCENARIOS
 from lanebev.types import Status
+from tests.estimation.joint_drives import follow
 from tools.reproduce_table1 import VARIANCES, run, table
 
 torch.set_num_threads(1)
@@ -214,12 +215,8 @@ def test_a_boundary_where_none_can_be_is_not_believed_for_a_frame():
     """A vague detector takes the foot of a barrier for a lane's edge once: its sigmas would let it pass."""
     places = PLACES + torch.tensor([0.0, 1.0, 0, 0, 0, 0], dtype=torch.float64)
     drive = moments(1.0, lambda t, moment: replace(moment, places=places) if t > 0.95 else moment)
-    calibrator, state = JointCalibrator(), JointCalibrator().initial_state(2, dtype=torch.float64)
-    believed = []
-    with torch.inference_mode():
-        for moment, segments in observe(drive, 2, 20.0, 30, 0, torch.float64):
-            out, state = calibrator(segments, CAMERA.expand(2, 3, 3), state, moment.dt, WIDTH)
-            believed.append(out.inliers[segments.boundary == 1].mean())
+    followed = follow(drive, rows=2, sigma=20.0, per_boundary=30)
+    believed = [frame.calibration.inliers[frame.segments.boundary == 1].mean() for frame in followed]
     assert torch.stack(believed[10:-2]).min() > 0.8
     assert believed[-1] == 0
 
@@ -247,15 +244,11 @@ def test_a_boundary_where_none_can_be_is_not_believed(sigma):
     """The foot of a barrier, a metre nearer than a lane's edge, by a sharp detector or by a vague one."""
     shift = torch.tensor([0.0, 1.0, 0, 0, 0, 0], dtype=torch.float64)
     drive = moments(1.0, lambda t, moment: replace(moment, places=PLACES + shift))
-    calibrator, state = JointCalibrator(), JointCalibrator().initial_state(2, dtype=torch.float64)
-    with torch.inference_mode():
-        for moment, segments in observe(drive, 2, sigma, 30, 0, torch.float64):
-            out, state = calibrator(segments, CAMERA.expand(2, 3, 3), state, moment.dt, WIDTH)
-    foot = segments.boundary == 1
-    assert (out.inliers[foot] < 0.5).all()
-    assert out.inliers[~foot].mean() > 0.95
-    error = (out.extrinsics.stack() - torch.tensor(moment.pose, dtype=torch.float64)).abs()
-    assert (error < 4 * out.covariance.diagonal(dim1=1, dim2=2).sqrt()).all()
+    last = follow(drive, rows=2, sigma=sigma, per_boundary=30)[-1]
+    foot, inliers = last.segments.boundary == 1, last.calibration.inliers
+    assert (inliers[foot] < 0.5).all()
+    assert inliers[~foot].mean() > 0.95
+    assert (last.error.abs() < 4 * last.sigma).all()
 
 
 @pytest.mark.slow
@@ -296,13 +289,10 @@ def test_comes_back_within_half_a_second_of_a_cut_and_is_honest_before(visible):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["50 % outliers, 5 % wrong index", "unequal lanes", "bumps 1 deg in 0.2 s"])
 def test_does_not_start_anew_without_a_shock(name):
-    calibrator, change = JointCalibrator(), SCENARIOS[name][1]
-    state = calibrator.initial_state(3, dtype=torch.float64)
-    with torch.inference_mode():
-        for k, (moment, segments) in enumerate(observe(moments(1.3, change), 3, 1.0, 8, 1, torch.float64)):
-            _, state = calibrator(segments, CAMERA.expand(3, 3, 3), state, moment.dt, WIDTH)
-            started = (state.reasons & int(Reason.RESTARTED)) != 0
-            assert started.tolist() == [k == 0] * 3
+    drive = moments(1.3, SCENARIOS[name][1])
+    for k, frame in enumerate(follow(drive, rows=3, per_boundary=8, seed=1)):
+        started = (frame.state.reasons & int(Reason.RESTARTED)) != 0
+        assert started.tolist() == [k == 0] * 3
 
 
 def test_a_cut_in_one_row_leaves_the_others_as_they_are():

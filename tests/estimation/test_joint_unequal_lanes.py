@@ -26,7 +26,7 @@ from lanebev.estimation.joint.output import (
 from lanebev.estimation.reasons import Reason
 from lanebev.testing.moments import CAMERA, PLACES, WIDTH, moments
 from lanebev.testing.moments import observe as see
-from tests.estimation.joint_drives import DOUBLE, drive, nothing, run
+from tests.estimation.joint_drives import DOUBLE, drive, follow, nothing, run
 
 torch.set_num_threads(1)
 
@@ -162,13 +162,9 @@ def test_a_small_difference_of_four_boundaries_may_be_a_large_one_of_their_lanes
     sigmas = []
     for there in (places, equal):
         drive = moments(3.0, lambda t, m, there=there: replace(m, visible=(1, 2, 3, 4), places=there))
-        calibrator = JointCalibrator()
-        state = calibrator.initial_state(4, dtype=DOUBLE)
-        for moment, segments in see(drive, 4, 1.0, 20, 0, DOUBLE):
-            calibration, state = calibrator(segments, CAMERA.expand(4, 3, 3), state, moment.dt, WIDTH)
-        error = calibration.extrinsics.stack() - torch.tensor(moment.pose, dtype=DOUBLE)
-        sigmas.append(calibration.covariance.diagonal(dim1=1, dim2=2).sqrt())
-        assert (error.abs() < 3 * sigmas[-1]).all()
+        last = follow(drive, rows=4)[-1]
+        sigmas.append(last.sigma)
+        assert (last.error.abs() < 3 * last.sigma).all()
     unequal, same = (sigma[:, ROLL].rad2deg() for sigma in sigmas)
     assert (unequal > 0.04).all()
     assert (same < 0.03).all()
@@ -178,16 +174,11 @@ def test_outliers_beside_unequal_lanes_are_no_bend():
     """Deviations are uncertain only together with the pose: end points beside their boundary are outliers."""
     out = torch.tensor([0.066, 0.027, 0.006, 0.062, -0.045, -0.017], dtype=DOUBLE)
     drive = moments(4.0, lambda t, m: replace(m, near=6.0, far=73.0, outliers=0.25, places=PLACES + out))
-    calibrator = JointCalibrator()
-    state, yaw = calibrator.initial_state(8, dtype=DOUBLE), []
-    for k, (moment, segments) in enumerate(see(drive, 8, 0.7, 30, 1, DOUBLE)):
-        calibration, state = calibrator(segments, CAMERA.expand(8, 3, 3), state, moment.dt, WIDTH)
-        if k >= 30:
-            assert (state.evidence[:, NUM_POSE : NUM_POSE + NUM_SHAPE].abs() < CALL).all()
-            yaw.append(
-                (calibration.extrinsics.yaw - moment.pose[1]).square() / calibration.covariance[:, 1, 1]
-            )
-    assert (torch.stack(yaw) < 9).double().mean() > 0.98
+    followed = follow(drive, rows=8, sigma=0.7, per_boundary=30, seed=1)[30:]
+    for frame in followed:
+        assert (frame.state.evidence[:, NUM_POSE : NUM_POSE + NUM_SHAPE].abs() < CALL).all()
+    yaw = torch.stack([(frame.error / frame.sigma)[:, 1] for frame in followed])
+    assert (yaw.abs() < 3).double().mean() > 0.98
 
 
 @pytest.mark.parametrize("visible", [(1, 2, 3), (2, 3, 4)])
@@ -197,16 +188,13 @@ def test_two_lanes_that_differ_are_within_the_standard_deviations(visible):
     places[visible[0]] += 0.05
     places[visible[2]] += 0.05
     drive = moments(0.5, lambda t, m: replace(m, visible=visible, places=places))
-    calibrator = JointCalibrator()
-    state = calibrator.initial_state(2, dtype=DOUBLE)
-    for moment, segments in see(drive, 2, 1.0, 20, 0, DOUBLE):  # from the first frame on
-        calibration, state = calibrator(segments, CAMERA.expand(2, 3, 3), state, moment.dt, WIDTH)
-        error = calibration.extrinsics.stack() - torch.tensor(moment.pose, dtype=DOUBLE)
-        sigma = calibration.covariance.diagonal(dim1=1, dim2=2).sqrt()
-        assert (error.abs() < 4 * sigma).all()
-    assert (error[:, ROLL].abs() > math.radians(0.2)).all()
-    assert (sigma[:, ROLL] < math.radians(1.0)).all()
-    assert (sigma[:, :2] < math.radians(0.1)).all()  # pitch and yaw do not depend on it
+    followed = follow(drive, rows=2)
+    for frame in followed:
+        assert (frame.error.abs() < 4 * frame.sigma).all()
+    last = followed[-1]
+    assert (last.error[:, ROLL].abs() > math.radians(0.2)).all()
+    assert (last.sigma[:, ROLL] < math.radians(1.0)).all()
+    assert (last.sigma[:, :2] < math.radians(0.1)).all()  # pitch and yaw do not depend on it
 
 
 def test_the_covariance_changes_gradually_when_boundaries_come_and_go():
@@ -216,12 +204,7 @@ def test_the_covariance_changes_gradually_when_boundaries_come_and_go():
         visible = (0, 1, 2, 3, 4, 5) if t < 0.99 else (1, 2, 3) if t < 1.99 else (1, 2, 3, 4)
         return replace(moment, visible=visible)
 
-    calibrator = JointCalibrator()
-    state, sigmas = calibrator.initial_state(1, dtype=DOUBLE), []
-    for moment, segments in see(moments(2.5, change), 1, 1.0, 20, 0, DOUBLE):
-        calibration, state = calibrator(segments, CAMERA.expand(1, 3, 3), state, moment.dt, WIDTH)
-        sigmas.append(calibration.covariance[0, ROLL, ROLL].sqrt().rad2deg())
-    sigma = torch.stack(sigmas)
+    sigma = torch.stack([frame.sigma[0, ROLL].rad2deg() for frame in follow(moments(2.5, change))])
     assert sigma[29] < 0.02
     assert (sigma[30:60] < 0.05).all()  # the six have shown that lanes are equal
     assert (sigma[60:] < 0.05).all()

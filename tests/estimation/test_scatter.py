@@ -35,6 +35,7 @@ from lanebev.testing.moments import CAMERA, PLACES, WIDTH, moments
 from lanebev.testing.moments import observe as see
 from lanebev.testing.segments import stack_rows
 from lanebev.testing.streets import wandering
+from tests.estimation.joint_drives import follow
 
 DOUBLE = torch.float64
 ONE_FRAME = 1 / 30
@@ -86,10 +87,8 @@ def test_parallel_boundaries_add_almost_nothing(visible):
     """With noise of 1 px, after half a second."""
     drive = moments(0.6, lambda t, m: replace(m, visible=visible))
     calibrator = JointCalibrator(lane_deviation_std=0.0, start_heading_std=0.0)
-    state = calibrator.initial_state(8, dtype=DOUBLE)
-    for moment, segments in see(drive, 8, 1.0, 20, 4, DOUBLE):
-        calibration, state = calibrator(segments, CAMERA.expand(8, 3, 3), state, moment.dt, WIDTH)
-    added = calibration.covariance.diagonal(dim1=1, dim2=2) / state.cov.diagonal(dim1=1, dim2=2)[:, :4]
+    last = follow(drive, calibrator, rows=8, seed=4)[-1]
+    added = last.sigma.square() / last.state.cov.diagonal(dim1=1, dim2=2)[:, :4]
     assert (added.median(0).values < 1.15).all()
     assert (added >= 1 - 1e-9).all()
 
@@ -112,12 +111,7 @@ def test_the_sensitivity_to_a_heading_that_lasts_is_the_change_of_the_filter_s_e
     states = []
     for turned in (0 * headings, headings):
         change = partial(lambda t, m, turned: replace(m, headings=turned, visible=visible), turned=turned)
-        state = CALIBRATOR.initial_state(1, dtype=DOUBLE)
-        passed = []
-        for moment, segments in see(moments(1.5, change), 1, 0.5, 20, 5, DOUBLE):
-            _, state = CALIBRATOR(segments, CAMERA[None], state, moment.dt, WIDTH)
-            passed.append(state)
-        states.append(passed[14::15])
+        states.append([one.state for one in follow(moments(1.5, change), sigma=0.5, seed=5)[14::15]])
     for before, after in zip(*states, strict=True):
         found = (after.mean - before.mean)[0, :4] / 1e-5
         expected = before.heading_sensitivity[0, :4, 3]
@@ -198,16 +192,13 @@ def test_headings_smaller_than_the_noise_of_a_frame_are_found_in_a_second():
     """Of 3 mrad, seen with 2 px: in three of four drives, and the covariance contains the error."""
     headings = 3e-3 * torch.tensor([1.0, -0.5, -1.0, 1.5, -1.0, 0.0], dtype=DOUBLE)
     drive = moments(1.5, lambda t, m: replace(m, headings=headings, far=30.0))
-    calibrator, rows = JointCalibrator(start_heading_std=0.0), 8
-    state = calibrator.initial_state(rows, dtype=DOUBLE)
-    for moment, segments in see(drive, rows, 2.0, 10, 3, DOUBLE):
-        calibration, state = calibrator(segments, CAMERA.expand(rows, 3, 3), state, moment.dt, WIDTH)
-    found = scatter_variance(state.scatter)[:, 1].sqrt()
+    calibrator = JointCalibrator(start_heading_std=0.0)
+    last = follow(drive, calibrator, rows=8, sigma=2.0, per_boundary=10, seed=3)[-1]
+    found = scatter_variance(last.state.scatter)[:, 1].sqrt()
     assert (found > 1e-3).double().mean() >= 0.75
-    error = calibration.extrinsics.stack() - torch.tensor(moment.pose, dtype=DOUBLE)
-    variances = calibration.covariance.diagonal(dim1=1, dim2=2)
-    assert (error.square() < 9 * variances).all()
-    assert error[:, PITCH].square().mean() > 9 * state.cov[:, PITCH, PITCH].mean()  # the filter's does not
+    assert (last.error.abs() < 3 * last.sigma).all()
+    by_filter = last.state.cov[:, PITCH, PITCH]
+    assert last.error[:, PITCH].square().mean() > 9 * by_filter.mean()  # which does not contain it
 
 
 @pytest.mark.parametrize(
@@ -218,11 +209,8 @@ def test_a_start_with_few_boundaries_claims_less_and_one_with_all_as_much(visibl
     [moment] = moments(ONE_FRAME, lambda t, m: replace(m, visible=visible))
     stds = []
     for config in (JointConfig(), JointConfig(start_heading_std=0.0)):
-        calibrator = JointCalibrator(config)
-        state = calibrator.initial_state(4, dtype=DOUBLE)
-        _, segments = next(iter(see([moment], 4, 1.0, 20, 7, DOUBLE)))
-        calibration, _ = calibrator(segments, CAMERA.expand(4, 3, 3), state, ONE_FRAME, WIDTH)
-        stds.append(calibration.covariance[:, PITCH, PITCH].sqrt())
+        [frame] = follow([moment], JointCalibrator(config), rows=4, seed=7)
+        stds.append(frame.sigma[:, PITCH])
     ratio = stds[0] / stds[1]
     assert ((ratio >= least) & (ratio <= most)).all()
 
@@ -267,23 +255,14 @@ def test_a_kerb_taken_for_a_boundary_beside_the_ego_lane_is_in_the_variance_of_r
     kerb = PLACES.clone()
     kerb[4] -= 1.0
     drive = moments(1.5, lambda t, m: replace(m, places=kerb, visible=(2, 3) if t < 0.5 else (2, 3, 4)))
-    calibrator = JointCalibrator()
-    state = calibrator.initial_state(1, dtype=DOUBLE)
-    for moment, segments in see(drive, 1, 1.0, 20, 0, DOUBLE):
-        calibration, state = calibrator(segments, CAMERA[None], state, moment.dt, WIDTH)
-    error = calibration.extrinsics.stack()[0] - torch.tensor(moment.pose, dtype=DOUBLE)
-    sigma = calibration.covariance[0].diagonal().sqrt()
-    assert math.degrees(error[ROLL].abs()) > 3.0
-    assert (error.abs() < 3 * sigma).all()
+    last = follow(drive)[-1]
+    assert math.degrees(last.error[0, ROLL].abs()) > 3.0
+    assert (last.error.abs() < 3 * last.sigma).all()
 
 
-def follow(drive, visible, seed=0, sigma=1.0):
-    """The calibration and state after a drive of which only these boundaries are in view."""
-    calibrator = JointCalibrator()
-    state = calibrator.initial_state(1, dtype=DOUBLE)
-    for moment, segments in see([replace(one, visible=visible) for one in drive], 1, sigma, 20, seed, DOUBLE):
-        calibration, state = calibrator(segments, CAMERA[None], state, moment.dt, WIDTH)
-    return calibration, state, torch.tensor(moment.pose, dtype=DOUBLE)
+def after(drive, visible, seed=0, sigma=1.0):
+    """The last frame of a drive of which only these boundaries are in view."""
+    return follow([replace(one, visible=visible) for one in drive], sigma=sigma, seed=seed)[-1]
 
 
 def test_two_boundaries_determine_how_headings_change_the_other_parameters():
@@ -297,10 +276,10 @@ def test_two_boundaries_determine_how_headings_change_the_other_parameters():
 
 def test_headings_of_the_ego_lane_s_boundaries_turn_pitch_and_yaw():
     """Lines that meet at a depth of w / Δη have a vanishing point lower by h Δη / w."""
-    _, state, pose = follow(moments(0.5), (2, 3))
-    by_headings = state.heading_sensitivity[0, :2]
-    ratio = pose[3] / WIDTH
-    assert by_headings[0, 2:4].abs().tolist() == [pytest.approx(ratio.item(), rel=0.05)] * 2
+    last = after(moments(0.5), (2, 3))
+    by_headings = last.state.heading_sensitivity[0, :2]
+    ratio = last.moment.pose[3] / WIDTH
+    assert by_headings[0, 2:4].abs().tolist() == [pytest.approx(ratio, rel=0.05)] * 2
     assert by_headings[0, 2:4].sum().abs() < 0.05 * ratio  # equal headings are no pitch
     assert by_headings[1, 2:4].abs().sum().item() == pytest.approx(1.0, rel=0.15)
     assert (by_headings[:, [0, 1, 4, 5]] == 0).all()
@@ -308,19 +287,18 @@ def test_headings_of_the_ego_lane_s_boundaries_turn_pitch_and_yaw():
 
 def test_a_vertical_curvature_that_two_boundaries_show_may_be_their_own_curvatures():
     """Their scatter is noise; that of six boundaries tells their headings, and a hill nothing of them."""
-    _, of_two, pose = follow(moments(0.2), (2, 3))
-    _, of_six, _ = follow(moments(0.2), (0, 1, 2, 3, 4, 5))
+    of_two, of_six = (after(moments(0.2), visible) for visible in ((2, 3), (0, 1, 2, 3, 4, 5)))
     width, scatter = torch.tensor([WIDTH], dtype=DOUBLE), torch.tensor([0.002**2], dtype=DOUBLE)
     nothing = torch.zeros(1, 2, dtype=DOUBLE)
     for curvature in (0.0, 1e-4):
-        expected = 37.0 * curvature * WIDTH / 2 / pose[3].item()
+        expected = 37.0 * curvature * WIDTH / 2 / of_two.moment.pose[3]
         hills = torch.tensor([curvature**2], dtype=DOUBLE)
         by_frames = 1e12 * torch.tensor([[1.0, curvature]], dtype=DOUBLE)
         for known in ({"hills": hills, "vertical": nothing}, {"vertical": by_frames}):
-            state = of_two._replace(**known)
+            state = of_two.state._replace(**known)
             found = heading_variance(state, scatter, wander_of_two(state, width), CONFIG).sqrt()
             assert found.item() == pytest.approx(expected, rel=0.02, abs=1e-6)
-            state = of_six._replace(**known)
+            state = of_six.state._replace(**known)
             found = heading_variance(state, scatter, wander_of_two(state, width), CONFIG).sqrt()
             assert found.item() == pytest.approx(0.002, rel=0.02)
 
@@ -335,8 +313,7 @@ def test_a_vertical_curvature_smaller_than_its_noise_is_none():
 def test_the_vertical_curvature_of_two_boundaries_is_found_without_the_prior_of_a_plane_road(sharpness):
     """The filter takes the road as plane at first; the sum over frames has the true curvature."""
     drive = moments(0.5, lambda t, m: replace(m, near=4.0, far=30.0, profile=sharpness))
-    _, state, _ = follow(drive, (2, 3), sigma=0.3)
-    known, pull = state.vertical[0].tolist()
+    known, pull = after(drive, (2, 3), sigma=0.3).state.vertical[0].tolist()
     assert pull / known == pytest.approx(sharpness, abs=3 * known**-0.5 + 0.05 * abs(sharpness))
 
 
@@ -350,12 +327,12 @@ def test_the_ego_lane_of_a_street_is_less_sure_than_that_of_parallel_boundaries(
     """Squares of the error of pitch in standard deviations; the boundaries of the streets wander by 5 cm."""
     squares, of_filter, added = [], [], []
     for seed in range(8):
-        calibration, state, pose = follow(ego_lane_of_a_street(seed, 0.05, 8.0), (2, 3), seed)
-        error = (calibration.extrinsics.stack()[0] - pose)[PITCH]
-        squares.append((error.square() / calibration.covariance[0, PITCH, PITCH]).item())
-        of_filter.append((error.square() / state.cov[0, PITCH, PITCH]).item())
-        parallel, state, _ = follow(moments(1.0, lambda t, m: replace(m, near=4.0, far=30.0)), (2, 3), seed)
-        added.append((parallel.covariance[0, PITCH, PITCH] / state.cov[0, PITCH, PITCH]).item())
+        street = after(ego_lane_of_a_street(seed, 0.05, 8.0), (2, 3), seed)
+        error = street.error[0, PITCH].square()
+        squares.append((error / street.sigma[0, PITCH].square()).item())
+        of_filter.append((error / street.state.cov[0, PITCH, PITCH]).item())
+        parallel = after(moments(1.0, lambda t, m: replace(m, near=4.0, far=30.0)), (2, 3), seed)
+        added.append((parallel.sigma[0, PITCH].square() / parallel.state.cov[0, PITCH, PITCH]).item())
     assert sum(squares) < 0.35 * sum(of_filter)
     assert sorted(added)[5] < 1.01  # a fifth of all show a vertical curvature by chance
 
@@ -365,10 +342,9 @@ def test_ego_lanes_of_streets_are_as_far_off_as_they_say(speed):
     """Squares of the errors in standard deviations between boundaries that wander by 15 cm."""
     squares, of_filter = [], []
     for seed in range(8):
-        calibration, state, pose = follow(ego_lane_of_a_street(seed, 0.15, speed), (2, 3), seed)
-        error = (calibration.extrinsics.stack()[0] - pose).square()
-        squares.append(error / calibration.covariance[0].diagonal())
-        of_filter.append(error / state.cov[0].diagonal()[:4])
+        street = after(ego_lane_of_a_street(seed, 0.15, speed), (2, 3), seed)
+        squares.append((street.error / street.sigma)[0].square())
+        of_filter.append(street.error[0].square() / street.state.cov[0].diagonal()[:4])
     outside, outside_filter = ((torch.stack(each) > 9.0).sum(0) for each in (squares, of_filter))
     assert (outside <= 1).all()  # in one drive of eight the curvatures are equal by chance
     assert (outside_filter[[0, 1]] >= 4).all()
@@ -384,13 +360,12 @@ def test_the_covariance_contains_the_boundaries_of_a_street_that_wander(speed):
 
     nees, nees_of_filter = [], []
     for seed in range(5):
-        drive = moments(0.5, partial(change, wandering(seed, 0.1)))
-        calibrator = JointCalibrator()
-        state = calibrator.initial_state(1, dtype=DOUBLE)
-        for moment, segments in see(drive, 1, 1.0, 20, seed, DOUBLE):
-            calibration, state = calibrator(segments, CAMERA[None], state, moment.dt, WIDTH)
-            error = calibration.extrinsics.stack() - torch.tensor(moment.pose, dtype=DOUBLE)
-            for covariance, found in ((calibration.covariance, nees), (state.cov[:, :4, :4], nees_of_filter)):
+        for frame in follow(moments(0.5, partial(change, wandering(seed, 0.1))), seed=seed):
+            error = frame.error
+            for covariance, found in (
+                (frame.calibration.covariance, nees),
+                (frame.state.cov[:, :4, :4], nees_of_filter),
+            ):
                 found.append((error @ torch.linalg.inv(covariance[0]) @ error.T).item() / 4)
     assert 0.2 < sum(nees) / len(nees) < 3.0
     assert sum(nees_of_filter) / len(nees_of_filter) > 30.0

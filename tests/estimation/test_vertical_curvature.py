@@ -19,9 +19,9 @@ from lanebev.observation.segments import LaneSegments
 from lanebev.testing.moments import CAMERA, FPS, WIDTH, Moment, moments
 from lanebev.testing.moments import observe as see
 from lanebev.types import Extrinsics
+from tests.estimation.joint_drives import DOUBLE, follow, run
 
 torch.set_num_threads(1)
-DOUBLE = torch.float64
 
 
 def crest(
@@ -31,14 +31,6 @@ def crest(
     drive = moments(frames / FPS, lambda t, m: replace(m, near=5.0, far=far, profile=vertical))
     seen = list(see(drive, rows, sigma, 20, 3, DOUBLE))
     return [(moment, one._replace(sigma=one.sigma.clamp(min=1.0))) for moment, one in seen]
-
-
-def run(calibrator: JointCalibrator, frames: list[tuple[Moment, LaneSegments]]):
-    rows = frames[0][1].boundary.shape[0]
-    state = calibrator.initial_state(rows, dtype=DOUBLE)
-    for moment, segments in frames:
-        out, state = calibrator(segments, CAMERA.expand(rows, 3, 3), state, moment.dt, WIDTH)
-    return out, state
 
 
 @pytest.mark.parametrize("vertical", [3e-4, -3e-4])
@@ -161,12 +153,8 @@ def test_the_dip_behind_a_crest_is_expected():
     ratios = []
     for memory in (20.0, 1e-3):
         calibrator = JointCalibrator(motion=MotionConfig(hill_memory=memory))
-        state, squares = calibrator.initial_state(4, dtype=DOUBLE), []
-        for moment, segments in see(moments(8.0, change), 4, 1.0, 15, 3, DOUBLE):
-            found, state = calibrator(segments, CAMERA.expand(4, 3, 3), state, moment.dt, WIDTH)
-            error = found.extrinsics.pitch - moment.pose[0]
-            squares.append(error.square() / found.covariance[:, 0, 0])
-        ratios.append(float(torch.stack(squares[100:]).mean()))
+        followed = follow(moments(8.0, change), calibrator, rows=4, per_boundary=15, seed=3)[100:]
+        ratios.append(float(torch.stack([(one.error / one.sigma)[:, 0].square() for one in followed]).mean()))
     assert ratios[0] < 1.5
     assert ratios[1] > 1.5 * ratios[0]
 
