@@ -1,10 +1,29 @@
-"""Clips of T frames: their numbers such as time steps, and the frames that begin a drive."""
+"""Clips of T frames: their intrinsics, numbers such as time steps, and the frames that begin a drive."""
 
 import torch
 from torch import Tensor, nn
 
+from lanebev.geometry.lens import check_intrinsics
 from lanebev.geometry.precision import common_dtype
 from lanebev.types import check_number_or_tensor, check_tensor
+
+
+def frame_cameras(intrinsics: Tensor, image: Tensor) -> Tensor:
+    """Return the intrinsics of every frame, (B, T, 3, 3) px.
+
+    Args:
+        intrinsics: (B, 3, 3), those of all frames, or (B, T, 3, 3).
+        image: (B, 3, H, W), which is one frame, or (B, T, 3, H, W).
+
+    Raises:
+        TypeError: not a tensor.
+        ValueError: another shape, or see :func:`~lanebev.geometry.lens.check_intrinsics`.
+    """
+    check_tensor("intrinsics", intrinsics)
+    each = image.ndim == 5 and intrinsics.ndim == 4
+    check_intrinsics(intrinsics, *image.shape[: 2 if each else 1])
+    steps = image.shape[1] if image.ndim == 5 else 1
+    return intrinsics if each else intrinsics.unsqueeze(1).expand(-1, steps, -1, -1)
 
 
 def per_frame(name: str, value: float | Tensor, batch: int, steps: int, like: Tensor) -> Tensor:

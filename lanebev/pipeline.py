@@ -12,9 +12,9 @@ import torch
 from torch import Tensor, nn
 
 from lanebev.batch import select_rows
-from lanebev.clips import drive_starts, per_frame
+from lanebev.clips import drive_starts, frame_cameras, per_frame
 from lanebev.estimation.expected_view import expected_vanishing_point
-from lanebev.geometry.lens import check_distortion, check_intrinsics
+from lanebev.geometry.lens import check_distortion
 from lanebev.geometry.precision import autocast_is_on, autocast_off, common_dtype
 from lanebev.numbers import check_number
 from lanebev.observation.boundary_detector import BoundaryDetector
@@ -24,7 +24,7 @@ from lanebev.observation.lines import LineExtractor
 from lanebev.observation.segments import LaneSegments, segments_from_vertices
 from lanebev.tensors import join_tensors
 from lanebev.torch_internals import register_pytree
-from lanebev.types import Calibration, Extrinsics, check_devices, check_tensor
+from lanebev.types import Calibration, Extrinsics, check_devices
 from lanebev.view.checks import doubt_intrinsics
 from lanebev.view.grid import BEVGrid, bev_from_image
 from lanebev.view.warp import BEVWarp
@@ -220,7 +220,7 @@ class LaneBEV(BoundaryDetector):
             ValueError: shapes or devices that don't fit, or an image of whole numbers.
         """
         check_images(image)
-        cameras = _frame_cameras(intrinsics, image)
+        cameras = frame_cameras(intrinsics, image)
         check_distortion(distortion, model, image.shape[0])
         if truncation is not None and truncation < 1:
             raise ValueError(f"truncation: expected 1 frame or more, or None, got {truncation}")
@@ -353,21 +353,3 @@ class LaneBEV(BoundaryDetector):
 def _configured(part: nn.Module, name: str, default: Any = None) -> Any:
     """Return a setting of a module's ``config``, if it has one."""
     return getattr(getattr(part, "config", None), name, default)
-
-
-def _frame_cameras(intrinsics: Tensor, image: Tensor) -> Tensor:
-    """Return the intrinsics of every frame, (B, T, 3, 3) px.
-
-    Args:
-        intrinsics: (B, 3, 3), those of all frames, or (B, T, 3, 3).
-        image: (B, 3, H, W), which is one frame, or (B, T, 3, H, W).
-
-    Raises:
-        TypeError: not a tensor.
-        ValueError: another shape, or see :func:`~lanebev.geometry.lens.check_intrinsics`.
-    """
-    check_tensor("intrinsics", intrinsics)
-    each = image.ndim == 5 and intrinsics.ndim == 4
-    check_intrinsics(intrinsics, *image.shape[: 2 if each else 1])
-    steps = image.shape[1] if image.ndim == 5 else 1
-    return intrinsics if each else intrinsics.unsqueeze(1).expand(-1, steps, -1, -1)

@@ -30,6 +30,7 @@ from lanebev.weights import load_segmenter
 from train.commands import command_parser, one_line_errors, versions
 
 SIZE, FPS, RENDERED = (720, 1280), 20, 8
+_REPEATS = 9  # of a forward pass
 
 
 def write_video(folder: Path, frames: int) -> tuple[str, str]:
@@ -45,17 +46,17 @@ def write_video(folder: Path, frames: int) -> tuple[str, str]:
     return str(video), str(camera)
 
 
-def forward_seconds(precision: str, repeats: int = 9) -> tuple[float, float]:
+def forward_seconds(precision: str) -> tuple[float, float]:
     """Time the network's forward pass on one image of its size: medians of wall and of processor time."""
     model = with_precision(LaneBEV.from_pretrained(), precision).eval()
     image = torch.rand(1, 3, *load_segmenter().image_size)
     taken = []
     with torch.inference_mode():
-        for _ in range(repeats + 2):
+        for _ in range(_REPEATS + 2):
             begin = _clocks()
             model.segmenter(image)
             taken.append(_since(begin))
-    wall, processor = (sorted(each)[repeats // 2] for each in zip(*taken[2:], strict=True))
+    wall, processor = (sorted(each)[_REPEATS // 2] for each in zip(*taken[2:], strict=True))
     return wall, processor
 
 

@@ -32,6 +32,7 @@ from lanebev.types import NUM_BOUNDARIES
 from train.commands import command_parser, one_line_errors
 
 COLUMNS = ("pitch_deg", "yaw_deg", "roll_deg", "height_m")
+_REWEIGHTINGS = 10
 
 
 class PseudoTruth(NamedTuple):
@@ -43,16 +44,13 @@ class PseudoTruth(NamedTuple):
     height_known: Tensor  # (B,) one lane
 
 
-def pseudo_ground_truth(
-    segments: LaneSegments, intrinsics: Tensor, lane_width: float, iterations: int = 10
-) -> PseudoTruth:
+def pseudo_ground_truth(segments: LaneSegments, intrinsics: Tensor, lane_width: float) -> PseudoTruth:
     """Compute the per-frame optimum of the paper's two measurements with the annotated lanes.
 
     Args:
         segments: (B, N) of annotated boundaries.
         intrinsics: (B, 3, 3) px.
         lane_width: m.
-        iterations: iterations of re-weighting by distance to the vanishing point.
 
     Returns:
         the optimum, per row.
@@ -63,7 +61,7 @@ def pseudo_ground_truth(
     normals = great_circle_normals(rays)
     forward = ends.new_tensor([0.0, 0.0, 1.0]).expand(batch, 3)
     direction = forward
-    for _ in range(iterations):
+    for _ in range(_REWEIGHTINGS):  # by the distance to the vanishing point
         noise = incidence_noise(rays, direction, sigma, intrinsics)
         direction, _ = vanishing_dir_least_squares(normals, noise, weight, forward)
     pitch, yaw = pitch_yaw_from_vanishing_dir(direction)

@@ -6,8 +6,7 @@ import pytest
 import torch
 
 from lanebev import JointCalibrator, Status, TwoStageCalibrator
-from lanebev.estimation.joint.frame.tempering import temper_frame
-from lanebev.estimation.joint.frame_prior import FramePrior, prior_of_mount
+from lanebev.estimation.joint.frame_prior import FramePrior, prior_of_mount, temper_frame
 from lanebev.estimation.still import calibrate_still
 from lanebev.testing.segments import INTRINSICS, lanes, no_lanes, stack_rows
 

@@ -87,12 +87,12 @@ def range_table(results: Results) -> list[str]:
     return lines
 
 
-def offset_table(true: list[dict[str, Any]], distance: float = 1.0) -> list[str]:
+def offset_table(true: list[dict[str, Any]]) -> list[str]:
     """Return lines of AP with the true pose rotated about one axis at a time."""
     lines = ["| axis | 0° | " + " | ".join(f"{d:g}°" for d in OFFSETS_DEG) + " |"]
     lines.append("|---" * (2 + len(OFFSETS_DEG)) + "|")
     for axis in AXES:
-        curve = offset_curve(true, axis, distance)
+        curve = offset_curve(true, axis, 1.0)
         lines.append(f"| {axis} | " + " | ".join(mean_and_spread(list(each)) for each in curve) + " |")
     return lines
 

@@ -24,7 +24,7 @@ from lanebev.estimation.joint.filter.speed import update_by_speed
 from lanebev.estimation.joint.filter.start import new_state, start_moments
 from lanebev.estimation.joint.filter.status import update_track_status
 from lanebev.estimation.joint.frame.averaging import weigh_readings
-from lanebev.estimation.joint.frame.tempering import temper_frame
+from lanebev.estimation.joint.frame_prior import temper_frame
 from lanebev.estimation.joint.layout import NUM_COMMON, STEPS, layout
 from lanebev.estimation.joint.measurement.observations import boundary_places, observations
 from lanebev.estimation.joint.measurement.residuals import CURVATURE, VERTICAL

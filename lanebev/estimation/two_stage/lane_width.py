@@ -13,6 +13,7 @@ from lanebev.observation.segments import LaneSegments
 
 _MIN_RADIUS = 1e-3  # a ray closer than 0.06 deg to the vanishing direction has no information
 _MIN_COSINE = 0.02  # 1.1 deg: a boundary plane closer to the road's own has no foot on it
+_SEARCH_RANGE, _SEARCH_STEPS = math.radians(30.0), 121  # rolls to either side of the guess, rad
 
 
 class BoundaryAngles(NamedTuple):
@@ -255,8 +256,6 @@ def initial_roll_height(
     boundaries: BoundaryAngles,
     lane_width: Tensor,
     roll_guess: Tensor,
-    search_range: float = math.radians(30.0),
-    num_steps: int = 121,
     num_iterations: int = 5,
 ) -> tuple[Tensor, Tensor]:
     """Find the roll and height of least :func:`width_energy`.
@@ -268,18 +267,15 @@ def initial_roll_height(
         boundaries: from :func:`boundary_angles`.
         lane_width: (B, L-1) m, the prior.
         roll_guess: (B,) rad, the middle of the search, and the answer where roll is not observable.
-        search_range: rad to either side.
-        num_steps: number of steps of the search.
         num_iterations: number of Gauss-Newton steps.
 
     Returns:
         roll (B,) rad and height (B,) m. Height is 1 where no lane is present.
     """
-    rolls = torch.linspace(
-        -search_range, search_range, num_steps, dtype=lane_width.dtype, device=lane_width.device
-    )
+    ends = (-_SEARCH_RANGE, _SEARCH_RANGE, _SEARCH_STEPS)
+    rolls = torch.linspace(*ends, dtype=lane_width.dtype, device=lane_width.device)
     rolls = roll_guess.unsqueeze(-1) + rolls  # (B, G)
-    repeated = BoundaryAngles(*(part.repeat_interleave(num_steps, 0) for part in boundaries))
+    repeated = BoundaryAngles(*(part.repeat_interleave(_SEARCH_STEPS, 0) for part in boundaries))
     unit = measure_widths(repeated, rolls.flatten(), torch.ones_like(rolls.flatten()))
     shape = (*rolls.shape, -1)
     widths, present = unit.widths.reshape(shape), unit.present.reshape(shape)  # (B, G, L-1) at height 1
@@ -291,7 +287,7 @@ def initial_roll_height(
     energy = torch.where(possible, width_energy(residuals), torch.inf)
     best = energy.argmin(-1, keepdim=True)
     observable = present.sum(-1).amax(-1) >= 2
-    middle = torch.full_like(best, num_steps // 2)
+    middle = torch.full_like(best, _SEARCH_STEPS // 2)
     best = torch.where(observable.unsqueeze(-1), best, middle)
     roll, height = rolls.gather(-1, best).squeeze(-1), heights.gather(-1, best).squeeze(-1)
     height = torch.where(height > 0, height, 1.0)

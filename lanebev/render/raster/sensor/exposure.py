@@ -15,14 +15,14 @@ _PER_ROOT, _LEVELS = 4096, 8192  # entries of the table of tones: up to a linear
 _MIDDLE = 0.45  # display level that the contrast leaves as it is
 
 
-def expose(radiance: Tensor, sensor: Sensor, road_level: Tensor, bloom: bool = True) -> Tensor:
+def expose(radiance: Tensor, sensor: Sensor, road_level: Tensor, bloom: bool) -> Tensor:
     """Convert radiance to display values, without noise.
 
     Args:
         radiance: (B, 3, H, W) linear.
         sensor: the cameras.
         road_level: (B,) radiance of the road; the exposure is set for it, and less for all the rest.
-        bloom: False if no camera has any.
+        bloom: whether any camera has some.
 
     Returns:
         (B, 3, H, W) display values in [0, 1].
