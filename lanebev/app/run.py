@@ -206,6 +206,7 @@ def _recorder(config: RunConfig, source: FrameSource, camera: Camera, out: Outpu
         grid=make_grid(config),
         videos=not config.no_video,
         smoothed=config.smooth,
+        given_lanes=config.lanes is not None,
     )
 
 

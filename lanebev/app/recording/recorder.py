@@ -24,8 +24,10 @@ from lanebev.camera.model import Camera
 from lanebev.estimation.mount import MountCalibration
 from lanebev.estimation.tracker import Estimate
 from lanebev.io.covariances import write_covariances
+from lanebev.io.formats.record import vertex_lines
 from lanebev.io.frames import Frame
 from lanebev.io.images.pixels import write_png
+from lanebev.io.lanes.contrast import LaneContrast
 from lanebev.io.lanes.tusimple import tusimple_line
 from lanebev.io.results import ExtrinsicsRow, extrinsics_row, write_extrinsics
 from lanebev.io.video.writer import VideoWriter
@@ -79,6 +81,7 @@ class Recorder:
         grid: grid of the bird's-eye view.
         videos: whether there are any.
         smoothed: whether every pose is from the whole drive.
+        given_lanes: whether the lanes are those of a file.
         rows: rows of extrinsics.csv, one for each frame.
         problems: what went wrong, for the report.
     """
@@ -92,6 +95,7 @@ class Recorder:
     grid: BEVGrid = field(default_factory=BEVGrid)
     videos: bool = True
     smoothed: bool = False
+    given_lanes: bool = False
     rows: StoredRows = field(default_factory=StoredRows)
     problems: list[str] = field(default_factory=list)
 
@@ -106,6 +110,7 @@ class Recorder:
         self._widths = StoredNumbers(2, NUM_BOUNDARIES - 1, folder=self.path("."))
         self._moments, self._scores = MomentSampler(), EventScores()
         self._repeats, self._views = RepeatedFrames(self.path(".")), ViewChanges()
+        self._contrast = LaneContrast()
 
     def __enter__(self) -> Recorder:
         self._stack = ExitStack()
@@ -156,7 +161,10 @@ class Recorder:
             write_extrinsics(self.path("filtered.csv"), self._filtered_rows)
         before, after = self._widths.all().transpose(1, 0, 2)
         of_drive = [] if self.stills else [self._views.remark(), self._repeats.remark()]
-        remarks = (*of_drive, drive_remark(self.rows))
+        of_lanes = self._contrast.remark()
+        if of_lanes:
+            of_lanes = f"lanes: {of_lanes} see the pictures of report.html"
+        remarks = (*of_drive, of_lanes, drive_remark(self.rows))
         report = Report(
             title=title,
             rows=self.rows,
@@ -182,6 +190,9 @@ class Recorder:
     @torch.inference_mode()
     def _draw(self, done: Recorded) -> None:
         """Write a frame's lanes and pictures, and keep what the report shows of it."""
+        if self.given_lanes:
+            lines = vertex_lines(done.seen.vertices).values()
+            self._contrast.add(done.frame.number, done.frame.image, lines)
         segments, calibration, _, vertical = done.estimate
         curves = lane_curves(segments, calibration, self.camera, vertical)
         self._lanes.write(tusimple_line(done.name, *curves, *done.seen) + "\n")

@@ -2,7 +2,11 @@
 
 import logging
 
+import numpy as np
+from numpy.typing import NDArray
+
 from lanebev.camera.model import Camera
+from lanebev.io.lanes.contrast import LaneContrast
 from lanebev.io.lanes.parsing import FrameLines
 from lanebev.io.lanes.remarks import unequal_lanes_remark
 from lanebev.io.lanes.size import size_doubt
@@ -14,7 +18,7 @@ logger = logging.getLogger(__name__)
 
 
 class LaneDoubts:
-    """Notices polylines in pixels of other images, or of unequal lanes; logs it once, as long as it lasts.
+    """Notices polylines of other images, or of unequal lanes; logs it once, as long as it lasts.
 
     Attributes:
         doubt: the doubt about the last frames that were judged, in words; empty if there is none.
@@ -24,15 +28,20 @@ class LaneDoubts:
         self.doubt = ""
         self._camera = camera
         self._drawn: list[FrameLines] = []
+        self._contrast = LaneContrast()
 
-    def add(self, lines: FrameLines) -> None:
-        """Take the polylines of one frame, and judge all since the last time if they are enough."""
-        self._drawn += [lines] if lines.lines else []
+    def add(self, lines: FrameLines, image: NDArray[np.uint8] | None = None) -> None:
+        """Take the polylines of one frame (H, W, 3), and judge all since the last time if they are enough."""
+        if not lines.lines:
+            return
+        self._contrast.add(len(self._drawn), image, (line.points for line in lines.lines))
+        self._drawn.append(lines)
         if len(self._drawn) < _LOOKED_AT:
             return
         found = size_doubt(self._drawn, self._camera.image_size)
-        words = f"polylines: {found.words} {_REMEDY}" if found else ""
+        of_images = found.words if found else self._contrast.remark()
+        words = f"polylines: {of_images} {_REMEDY}" if of_images else ""
         words = words or unequal_lanes_remark(self._drawn, self._camera)
         if words and not self.doubt:
             logger.warning(words)
-        self.doubt, self._drawn = words, []
+        self.doubt, self._drawn, self._contrast = words, [], LaneContrast()
