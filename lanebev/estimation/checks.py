@@ -107,11 +107,12 @@ def mask_invalid_rows(
     Args:
         segments: unchecked segments, see :func:`clean_segments`.
         intrinsics: (B, 3, 3), unusable where not finite, transposed or without a positive focal length.
-        lane_width: (B, M) m, unusable where one is not finite and positive.
+        lane_width: (B, M) m, unusable where one is not in LANE_WIDTHS, as in feet or cm.
         num_boundaries: L.
     """
     segments = clean_segments(segments, num_boundaries)
-    good = usable_cameras(intrinsics) & (lane_width.isfinite() & (lane_width > 0)).all(-1)  # (B,)
+    least, most = LANE_WIDTHS
+    good = usable_cameras(intrinsics) & ((lane_width >= least) & (lane_width <= most)).all(-1)  # (B,)
     weight = torch.where(good.unsqueeze(-1), segments.weight, 0.0)
     return (
         segments._replace(weight=weight),

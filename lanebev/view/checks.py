@@ -12,7 +12,7 @@ from lanebev.tensors import constant
 from lanebev.types import Extrinsics, check_devices, check_extrinsics, check_tensor
 
 _SAME_SHAPE = 1.25  # factor between height over width of a map and of the image that it covers, padded
-_CORNER = 0.9  # fraction of width and height beyond which a principal point is doubted
+_CORNERS = (0.3, 0.9)  # fractions of width and height below or beyond which a principal point is doubted
 _BESIDE = -1e6  # px, place of every point in the image of a camera that cannot be used
 
 
@@ -124,10 +124,11 @@ def check_cameras(
 
 
 def doubt_intrinsics(intrinsics: Tensor, size: tuple[int, int]) -> None:
-    """Warn if the principal points are at the lower right corner of images of (H, W) px, or beyond it.
+    """Warn if the principal points are at the upper left or lower right corner of images, or beyond.
 
-    Intrinsics of a larger image are so: of one that was made smaller, or of that which a feature map covers.
-    Where reading numbers would wait for a device, there is no warning.
+    Intrinsics of a smaller or larger image are so: of one that was resized, or of that which a feature map
+    covers; also intrinsics in shares of the sides, and inverted ones. Where reading numbers would wait for a
+    device, there is no warning.
 
     Args:
         intrinsics: (..., 3, 3) px.
@@ -136,9 +137,16 @@ def doubt_intrinsics(intrinsics: Tensor, size: tuple[int, int]) -> None:
     if not (readable(intrinsics) and intrinsics.numel()):
         return
     x, y = intrinsics.detach()[..., :2, 2].unbind(-1)
-    if bool(((x > _CORNER * size[1]) & (y > _CORNER * size[0])).all()):
-        warnings.warn(
-            "intrinsics: expected those of the image, got a principal point at its lower right corner or "
-            "beyond: scale them as the image, or give image_size=(H, W) of the image with a feature map",
-            stacklevel=2,
-        )
+    (height, width), (low, high) = size, _CORNERS
+    at_corners = {
+        "upper left": (x < low * width) & (y < low * height),
+        "lower right": (x > high * width) & (y > high * height),
+    }
+    for corner, is_there in at_corners.items():
+        if bool(is_there.all()):
+            warnings.warn(
+                f"intrinsics: expected those of the image, in pixels, got a principal point at its {corner} "
+                "corner or beyond: scale them as the image, or give image_size=(H, W) of the image with a "
+                "feature map",
+                stacklevel=2,
+            )

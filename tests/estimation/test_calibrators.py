@@ -44,6 +44,16 @@ def test_autocast_changes_nothing_and_gradients_flow(calibrator):
 
 
 @BOTH
+@pytest.mark.parametrize("width", [12.0, 370.0, 0.37, -3.7, math.nan])
+def test_a_row_with_an_impossible_lane_width_does_not_start(calibrator, width):
+    """Lanes in feet would make the camera 4.6 m high, and the status TRACKING."""
+    both, state = stack_rows(lanes(), lanes()), calibrator.initial_state(2)
+    out, _ = calibrator(both, K.expand(2, 3, 3), state, 1 / 30, torch.tensor([3.7, width]))
+    assert out.status.tolist() == [Status.TRACKING, Status.UNINITIALISED]
+    assert finite(out)
+
+
+@BOTH
 @pytest.mark.parametrize("kind", ["nan", "index", "weight"])
 def test_what_cannot_be_used_keeps_no_row_from_starting(calibrator, kind):
     junk = lanes(per=40)

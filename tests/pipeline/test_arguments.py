@@ -379,6 +379,16 @@ def test_intrinsics_of_a_larger_image_are_doubted(model):
         BEVWarp(GRID)(features.expand(2, 4, 45, 80), torch.cat([K, K / 8]), POSE_TWICE)
 
 
+@pytest.mark.parametrize("scale", [0.5, 0.25, 1 / 96], ids=["half the size", "a quarter", "shares of a side"])
+def test_intrinsics_of_a_smaller_image_are_doubted(model, scale):
+    """Pitch and yaw would be tens of degrees off, and called TRACKING."""
+    smaller = torch.cat([scale * SMALL_K[:, :2], SMALL_K[:, 2:]], 1)
+    with pytest.warns(UserWarning, match="in pixels, got a principal point at its upper left corner"):
+        model(IMAGE, smaller, bev=False)
+    with pytest.warns(UserWarning, match="upper left corner"):
+        BEVWarp(GRID)(IMAGE, torch.linalg.inv(SMALL_K), POSE)
+
+
 def test_an_image_of_more_contrast_is_no_normalised_one(model):
     assert model(0.5 + 1.8 * (IMAGE - 0.5), SMALL_K)[0].logits.isfinite().all()
 
