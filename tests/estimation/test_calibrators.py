@@ -8,6 +8,7 @@ import torch
 from lanebev import JointCalibrator, LaneSegments, Status, TwoStageCalibrator
 from lanebev.testing.segments import INTRINSICS as K
 from lanebev.testing.segments import POSE, lanes, no_lanes, stack_rows
+from tests.calibrators import CALIBRATORS
 from tests.estimation.calibrated import drive, finite
 
 
@@ -19,17 +20,12 @@ def test_lane_width_uncertainty_reaches_the_covariance(kind):
     assert float(added.sqrt()) == pytest.approx(float(plain[-1].extrinsics.height[0]) * 0.1 / 3.7, rel=1e-6)
 
 
-BOTH = pytest.mark.parametrize(
-    "calibrator", [TwoStageCalibrator(), JointCalibrator()], ids=["two-stage", "joint"]
-)
-
-
 def single(values):
     """The same in float32."""
     return type(values)(*(v.float() if v.is_floating_point() else v for v in values))
 
 
-@BOTH
+@CALIBRATORS
 def test_autocast_changes_nothing_and_gradients_flow(calibrator):
     found = []
     for enabled in (False, True):
@@ -43,7 +39,7 @@ def test_autocast_changes_nothing_and_gradients_flow(calibrator):
     assert all(torch.equal(a, b) for a, b in zip(*found, strict=True))
 
 
-@BOTH
+@CALIBRATORS
 @pytest.mark.parametrize("width", [12.0, 370.0, 0.37, -3.7, math.nan])
 def test_a_row_with_an_impossible_lane_width_does_not_start(calibrator, width):
     """Lanes in feet would make the camera 4.6 m high, and the status TRACKING."""
@@ -53,7 +49,7 @@ def test_a_row_with_an_impossible_lane_width_does_not_start(calibrator, width):
     assert finite(out)
 
 
-@BOTH
+@CALIBRATORS
 @pytest.mark.parametrize("kind", ["nan", "index", "weight"])
 def test_what_cannot_be_used_keeps_no_row_from_starting(calibrator, kind):
     junk = lanes(per=40)
@@ -78,7 +74,7 @@ BAD_ROWS = {
 }
 
 
-@BOTH
+@CALIBRATORS
 @pytest.mark.parametrize("kind", sorted(BAD_ROWS))
 def test_a_row_without_camera_or_lane_width_sees_nothing(calibrator, kind):
     factor, width = BAD_ROWS[kind]
@@ -95,7 +91,7 @@ def test_a_row_without_camera_or_lane_width_sees_nothing(calibrator, kind):
     torch.testing.assert_close(out.extrinsics.stack()[1], expected.extrinsics.stack()[1])
 
 
-@BOTH
+@CALIBRATORS
 @pytest.mark.parametrize("count", [0, 1])
 def test_frames_of_no_or_one_segment_are_as_padded_ones(calibrator, count):
     _, started = drive(calibrator, [lanes(seed=s) for s in range(3)])
@@ -114,7 +110,7 @@ def twice(state):
     return type(state)(*(v.repeat(2, *[1] * (v.ndim - 1)) for v in state))
 
 
-@BOTH
+@CALIBRATORS
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_results_have_the_dtype_of_the_state_whatever_comes(calibrator, dtype):
     state, width = calibrator.initial_state(1, dtype=dtype), torch.full((1, 5), 3.7)
@@ -127,7 +123,7 @@ def test_results_have_the_dtype_of_the_state_whatever_comes(calibrator, dtype):
         )
 
 
-@BOTH
+@CALIBRATORS
 def test_what_does_not_fit_the_batch_is_named(calibrator):
     segments, cameras = stack_rows(lanes(), lanes()), K.expand(2, 3, 3)
     state = calibrator.initial_state(2, dtype=torch.float64)

@@ -12,6 +12,7 @@ from lanebev.estimation.mount import MountEstimator
 from lanebev.estimation.two_stage.calibrator import TwoStageCalibrator
 from lanebev.io.state import VERSION, load_state, save_state
 from lanebev.testing.moments import CAMERA, FPS, moments, observe
+from tests.calibrators import CALIBRATORS
 
 
 @pytest.fixture
@@ -148,7 +149,7 @@ def test_resuming_gives_bit_for_bit_what_an_uninterrupted_run_gives(tmp_path):
             assert torch.equal(one, other)
 
 
-@pytest.mark.parametrize("calibrator", [JointCalibrator(), TwoStageCalibrator()], ids=["joint", "two-stage"])
+@CALIBRATORS
 def test_every_calibrator_answers_its_interface(calibrator):
     """Callers need no type of their own: passes on a still, curvature or None, a state that detaches."""
     [(_, segments)] = observe(moments(1 / FPS), 2, 1.0, 8, 0, torch.float64)

@@ -3,7 +3,16 @@
 import torch
 from torch import nn
 
-from lanebev import BEVGrid, BEVWarp, LaneBEV, LaneSegments, TwoStageCalibrator
+from lanebev import (
+    BEVGrid,
+    BEVWarp,
+    LaneBEV,
+    LaneSegmenter,
+    LaneSegments,
+    LineExtractor,
+    SegmenterConfig,
+    TwoStageCalibrator,
+)
 from lanebev.geometry.lens import distort_points
 from lanebev.observation.boundary_vertices import BoundaryVertices
 from lanebev.testing.segments import INTRINSICS as K
@@ -56,6 +65,14 @@ def model(**kwargs):
         BrightnessSegmenter(), FixedExtractor(kwargs.pop("distortion", None)), TwoStageCalibrator(),
         BEVWarp(GRID), **kwargs,
     )  # fmt: skip
+
+
+def small_model(calibrator=None, seed=0):
+    """A real network, untrained and small, with a real extractor, in single precision."""
+    torch.manual_seed(seed)
+    config = SegmenterConfig(base_width=4, decoder_width=8)
+    calibrator = calibrator or TwoStageCalibrator()
+    return LaneBEV(LaneSegmenter(config), LineExtractor.for_network(config), calibrator, BEVWarp(GRID))
 
 
 def images(*shape, seed=0):

@@ -1,9 +1,11 @@
+"""Operations on rows of a batch."""
+
 import pytest
 import torch
 from torch.export import Dim
 
 from lanebev import batch
-from lanebev.batch import flags, in_blocks, order_true_first, replace_rows
+from lanebev.batch import flags, in_blocks, masked_median, order_true_first, replace_rows
 from lanebev.estimation.reasons import Reason
 from lanebev.tensors import constant
 from lanebev.types import Extrinsics
@@ -13,6 +15,13 @@ def test_true_entries_come_first_and_both_groups_keep_their_order():
     mask = torch.tensor([[False, True, False, True], [True, True, True, True], [False] * 4])
     assert order_true_first(mask).tolist() == [[1, 3, 0, 2], [0, 1, 2, 3], [0, 1, 2, 3]]
     assert order_true_first(mask[:, :0]).shape == (3, 0)
+
+
+def test_masked_median_is_the_lower_one_of_what_is_finite_and_in_the_mask():
+    values = torch.tensor([[3.0, 1.0, torch.nan, torch.inf, 2.0, 9.0], [5.0, 4.0, 0.0, 0.0, 0.0, 0.0]])
+    mask = torch.tensor([[True, True, True, True, True, False], [True, True, False, False, False, False]])
+    assert masked_median(values, mask).tolist() == [2.0, 4.0]
+    assert masked_median(values, mask & False).tolist() == [0.0, 0.0]
 
 
 def test_flags_are_the_bits_of_what_holds():

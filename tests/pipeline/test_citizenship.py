@@ -16,28 +16,20 @@ from lanebev import (
     LaneBEV,
     LaneSegmenter,
     LaneSegments,
-    LineExtractor,
-    SegmenterConfig,
     TwoStageCalibrator,
 )
 from lanebev.testing.segments import INTRINSICS as K
 from lanebev.testing.segments import lanes, no_lanes, stack_rows
-from tests.pipeline.rows import started
+from tests.calibrators import CALIBRATORS
+from tests.pipeline.rows import slopes, started
+from tests.pipeline.stand_ins import small_model
 
 DOUBLE = torch.float64
-CALIBRATORS = pytest.mark.parametrize(
-    "calibrator", [JointCalibrator(), TwoStageCalibrator()], ids=["joint", "two-stage"]
-)
 CAMERA = torch.tensor([[[100.0, 0.0, 63.5], [0.0, 100.0, 31.5], [0.0, 0.0, 1.0]]])
 
 
 def model(seed=0):
-    torch.manual_seed(seed)
-    config = SegmenterConfig(base_width=4, decoder_width=8)
-    grid = BEVGrid(x=(-6.0, 6.0), z=(6.0, 30.0), resolution=0.5)
-    return LaneBEV(
-        LaneSegmenter(config).eval(), LineExtractor.for_network(config), JointCalibrator(), BEVWarp(grid)
-    )
+    return small_model(JointCalibrator(), seed).eval()
 
 
 @pytest.mark.parametrize(
@@ -149,13 +141,7 @@ def test_gradients_of_view_pose_and_covariance_equal_finite_differences(calibrat
             mix.setdefault(name, torch.randn(part.shape, generator=generator, dtype=DOUBLE))
         return torch.stack([(part * mix[name]).flatten(1).sum(-1) for name, part in parts.items()])
 
-    step = torch.zeros((), dtype=DOUBLE, requires_grad=True)
-    values = along(step)  # (3, 4)
-    analytic = torch.stack(
-        [torch.autograd.grad(each, step, retain_graph=True)[0] for each in values.flatten()]
-    )
-    with torch.no_grad():
-        numeric = (along(size * torch.ones(())) - along(-size * torch.ones(()))).flatten() / (2 * size)
+    analytic, numeric = slopes(along, size)
     assert numeric.abs().max() > 0
     torch.testing.assert_close(analytic, numeric, rtol=2e-3, atol=1e-4 * float(numeric.abs().max()))
 

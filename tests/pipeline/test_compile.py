@@ -4,13 +4,6 @@ import pytest
 import torch
 
 from lanebev import (
-    BEVGrid,
-    BEVWarp,
-    JointCalibrator,
-    LaneBEV,
-    LaneSegmenter,
-    LineExtractor,
-    SegmenterConfig,
     Status,
     TwoStageCalibrator,
 )
@@ -21,15 +14,13 @@ from lanebev.tensors import constant
 from lanebev.testing.segments import INTRINSICS as K
 from lanebev.testing.segments import lanes, no_lanes, stack_rows
 from lanebev.types import Calibration, Extrinsics
+from tests.calibrators import QUICK_CALIBRATORS
+from tests.pipeline.stand_ins import small_model
 
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:Dynamo detected a call to a `functools.lru_cache`")
-@pytest.mark.parametrize(
-    "calibrator",
-    [JointCalibrator(iterations=1, start_iterations=1), TwoStageCalibrator(num_hypotheses=20)],
-    ids=["joint", "two-stage"],
-)
+@QUICK_CALIBRATORS
 def test_calibrators(calibrator):
     """Started, tracking and coasting: what compares the status sees each."""
     torch.compiler.reset()
@@ -55,13 +46,7 @@ def test_calibrators(calibrator):
 def test_the_whole_step():
     """Network, lines, calibrator and view in one graph."""
     torch.compiler.reset()
-    torch.manual_seed(0)
-    config = SegmenterConfig(base_width=4, decoder_width=8)
-    net = LaneBEV(
-        LaneSegmenter(config).eval(), LineExtractor.for_network(config),
-        TwoStageCalibrator(num_hypotheses=20),
-        BEVWarp(BEVGrid(x=(-6.0, 6.0), z=(6.0, 30.0), resolution=0.5)),
-    )  # fmt: skip
+    net = small_model(TwoStageCalibrator(num_hypotheses=20)).eval()
     compiled = torch.compile(net, backend="eager", fullgraph=True)
     camera = torch.tensor([[[80.0, 0.0, 63.5], [0.0, 80.0, 31.5], [0.0, 0.0, 1.0]]])
     state = other = net.initial_state(1)
@@ -94,15 +79,8 @@ def test_mount():
         torch.testing.assert_close(found.extrinsics.stack(), expected.extrinsics.stack())
 
 
-@pytest.mark.filterwarnings("ignore:Dynamo detected a call to a `functools.lru_cache`")
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "calibrator",
-    [JointCalibrator(iterations=1, start_iterations=1), TwoStageCalibrator(num_hypotheses=20)],
-    ids=["joint", "two-stage"],
-)
-def test_numbers_that_vary_make_no_graph_per_frame(calibrator):
-    """Every video of variable frame rate: dt as a float, another one in each frame; lanes of a map."""
+def recording_backend():
+    """A list of graphs, and a backend that adds to it."""
     torch.compiler.reset()
     graphs = []
 
@@ -110,6 +88,15 @@ def test_numbers_that_vary_make_no_graph_per_frame(calibrator):
         graphs.append(module)
         return module.forward
 
+    return graphs, backend
+
+
+@pytest.mark.filterwarnings("ignore:Dynamo detected a call to a `functools.lru_cache`")
+@pytest.mark.slow
+@QUICK_CALIBRATORS
+def test_numbers_that_vary_make_no_graph_per_frame(calibrator):
+    """Every video of variable frame rate: dt as a float, another one in each frame; lanes of a map."""
+    graphs, backend = recording_backend()
     compiled = torch.compile(calibrator, backend=backend)
     state = calibrator.initial_state(1, dtype=torch.float64)
     for frame in range(6):
@@ -119,13 +106,7 @@ def test_numbers_that_vary_make_no_graph_per_frame(calibrator):
 
 
 def test_neither_does_that_of_a_clip():
-    torch.compiler.reset()
-    graphs = []
-
-    def backend(module, _):
-        graphs.append(module)
-        return module.forward
-
+    graphs, backend = recording_backend()
     compiled = torch.compile(lambda dt, like: 2 * per_frame("dt", dt, 2, 3, like), backend=backend)
     for frame in range(6):
         dt = 0.033 + 1e-4 * frame

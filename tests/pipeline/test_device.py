@@ -6,6 +6,7 @@ import torch
 import lanebev
 from lanebev import BEVGrid, BEVWarp, Extrinsics
 from lanebev.testing.segments import INTRINSICS, lanes
+from tests.calibrators import CALIBRATORS
 
 GRID = BEVGrid(resolution=1.0)
 
@@ -27,7 +28,7 @@ def _assert_there(value, device, dtype):
         _assert_there(part, device, dtype)
 
 
-@pytest.mark.parametrize("calibrator", [lanebev.JointCalibrator(), lanebev.TwoStageCalibrator()])
+@CALIBRATORS
 def test_calibrators(calibrator, device, dtype):
     segments, intrinsics = _moved(lanes(), device, dtype), INTRINSICS[None].to(device, dtype)
     state = calibrator.initial_state(1, dtype=dtype, device=device)

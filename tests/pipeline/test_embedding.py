@@ -16,12 +16,7 @@ from lanebev import (
     CanonicalView,
     Extrinsics,
     ImageFromBEV,
-    JointCalibrator,
-    LaneBEV,
-    LaneSegmenter,
     LaneSegments,
-    LineExtractor,
-    SegmenterConfig,
     Status,
     TwoStageCalibrator,
     bev_from_image,
@@ -32,22 +27,13 @@ from lanebev.tensors import identity
 from lanebev.testing.segments import INTRINSICS as K
 from lanebev.testing.segments import lanes, no_lanes, stack_rows
 from lanebev.weights import load_segmenter
+from tests.calibrators import CALIBRATORS
 from tests.pipeline.stand_ins import INTRINSICS as SMALL_K
-from tests.pipeline.stand_ins import images
+from tests.pipeline.stand_ins import images, small_model
 from tests.pipeline.stand_ins import model as stand_in
 
 CAMERA = torch.tensor([[[100.0, 0.0, 63.5], [0.0, 100.0, 31.5], [0.0, 0.0, 1.0]]])
 POSE = Extrinsics.unstack(torch.tensor([[0.02, 0.01, -0.01, 1.5]]))
-CALIBRATORS = pytest.mark.parametrize(
-    "calibrator", [JointCalibrator(), TwoStageCalibrator()], ids=["joint", "two-stage"]
-)
-
-
-def model(seed=0):
-    torch.manual_seed(seed)
-    config = SegmenterConfig(base_width=4, decoder_width=8)
-    warp = BEVWarp(BEVGrid(x=(-6.0, 6.0), z=(6.0, 30.0), resolution=0.5))
-    return LaneBEV(LaneSegmenter(config), LineExtractor.for_network(config), TwoStageCalibrator(), warp)
 
 
 def same_view(one, other):
@@ -58,9 +44,9 @@ def same_view(one, other):
 
 @pytest.mark.parametrize("way", ["to_empty", "assign"])
 def test_a_model_that_was_built_without_memory_computes_as_the_one_it_is_loaded_from(way):
-    made = model()
+    made = small_model()
     with torch.device("meta"):
-        loaded = model(seed=1)
+        loaded = small_model(seed=1)
     if way == "to_empty":
         loaded.to_empty(device="cpu")
         for part in (*loaded.parameters(), *loaded.buffers()):
@@ -133,7 +119,7 @@ def test_constants_of_fake_tensors_are_not_kept():
 @CALIBRATORS
 def test_shapes_are_found_without_computing(calibrator):
     """By a tool that estimates memory; the model computes afterwards as before."""
-    made = model().eval()
+    made = small_model().eval()
     made.calibrator = calibrator
     image = torch.rand(2, 3, 64, 128, generator=torch.Generator().manual_seed(1))
     expected, state = made(image, CAMERA.expand(2, 3, 3))
@@ -186,7 +172,7 @@ def test_mapped_rows_equal_those_of_a_batch(calibrator):
 
 @pytest.mark.slow
 def test_gradients_of_each_sample_are_those_of_it_alone():
-    made = model().eval()
+    made = small_model().eval()
     image = torch.rand(2, 3, 64, 128, generator=torch.Generator().manual_seed(1))
     weights = {name: value.detach() for name, value in made.named_parameters()}
 
@@ -445,7 +431,7 @@ def test_a_whole_model_is_recorded_by_torch_jit_trace():
     class Net(torch.nn.Module):
         def __init__(self):
             super().__init__()
-            self.lanes = model().eval()
+            self.lanes = small_model().eval()
 
         def forward(self, image, camera):
             out, _ = self.lanes(image, camera)
@@ -462,7 +448,7 @@ def test_a_whole_model_is_recorded_by_torch_jit_trace():
 @CALIBRATORS
 def test_a_model_on_the_device_meta_has_the_shapes_of_its_results(calibrator):
     """As a tool that counts operations runs it."""
-    made = model().eval()
+    made = small_model().eval()
     made.calibrator = calibrator
     made = made.to("meta")
     out, state = made(torch.rand(2, 3, 64, 128, device="meta"), CAMERA.repeat(2, 1, 1).to("meta"))

@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from lanebev import Camera, FarView, JointCalibrator, LaneBEV, Status, TwoStageCalibrator
+from lanebev import Camera, FarView, JointCalibrator, LaneBEV, Status
 from lanebev.app.config import RunConfig
 from lanebev.app.drive.observers import FarViewObserver
 from lanebev.app.drive.shared_network import SharedNetwork
@@ -23,6 +23,7 @@ from lanebev.geometry.vanishing_point import vanishing_point
 from lanebev.io.frames import Frame
 from lanebev.io.images.pixels import write_png
 from lanebev.render import Drive
+from tests.calibrators import CALIBRATORS
 
 DT, WIDTH = 0.05, 3.6
 
@@ -111,7 +112,7 @@ def test_the_expected_vanishing_point_is_that_of_the_state(drive, models):
     assert found[0].tolist() == pytest.approx(expected, abs=0.1)
 
 
-@pytest.mark.parametrize("calibrator", [JointCalibrator(), TwoStageCalibrator()])
+@CALIBRATORS
 def test_it_is_not_known_where_the_state_is_not_sure(calibrator):
     lens = Camera.from_fov(60.0, 320, 180).intrinsics.expand(3, 3, 3)
     state = calibrator.initial_state(3, torch.float64)

@@ -3,10 +3,11 @@
 import pytest
 import torch
 
-from lanebev import BEVGrid, BEVWarp, JointCalibrator, LineExtractor, TwoStageCalibrator
+from lanebev import BEVGrid, BEVWarp, JointCalibrator, LineExtractor
 from lanebev.testing.segments import INTRINSICS as K
 from lanebev.testing.segments import lanes
-from tests.pipeline.rows import started
+from tests.calibrators import CALIBRATORS
+from tests.pipeline.rows import slopes, started
 
 DOUBLE = torch.float64
 IMAGE, NETWORK, MAP = (720, 1280), (180, 320), (90, 160)  # (H, W) px, px, cells
@@ -40,7 +41,7 @@ def _outermost(ends):
 
 
 @pytest.mark.parametrize("of", [pytest.param("logits", marks=pytest.mark.slow), "pixels"])
-@pytest.mark.parametrize("calibrator", [JointCalibrator(), TwoStageCalibrator()], ids=["joint", "two-stage"])
+@CALIBRATORS
 def test_gradients_back_to_logits_and_pixels_equal_finite_differences(calibrator, of):
     """Rows that see six boundaries, one, none, and that are lost; along a random direction.
 
@@ -62,18 +63,10 @@ def test_gradients_back_to_logits_and_pixels_equal_finite_differences(calibrator
         parts = {"bev": bev, "pose": calibration.extrinsics.stack(), "cov": 1e3 * calibration.covariance}
         for name, part in parts.items():
             mix.setdefault(name, torch.randn(part.shape, generator=generator, dtype=DOUBLE))
-        sums = torch.stack([(part * mix[name]).flatten(1).sum(-1) for name, part in parts.items()])
-        return sums, segments.weight.detach()
+        assert (segments.weight > 0).any(1).tolist() == [True, True, False, True]
+        return torch.stack([(part * mix[name]).flatten(1).sum(-1) for name, part in parts.items()])
 
-    step = torch.zeros((), dtype=DOUBLE, requires_grad=True)
-    values, weight = along(step)  # (3, 4)
-    assert (weight > 0).any(1).tolist() == [True, True, False, True]
-    analytic = torch.stack(
-        [torch.autograd.grad(each, step, retain_graph=True)[0] for each in values.flatten()]
-    ).view_as(values)
-    with torch.no_grad():
-        size = 1e-6
-        numeric = (along(torch.tensor(size))[0] - along(torch.tensor(-size))[0]) / (2 * size)
+    analytic, numeric = slopes(along, 1e-6)  # (3, 4)
     assert (numeric[:, [0, 3]].abs() > 1e-9).all()  # what is seen matters, to all three
     if of == "pixels":
         assert numeric[0, 2].abs() > 1e-3  # of the row that sees nothing, to the view
@@ -84,7 +77,7 @@ def test_gradients_back_to_logits_and_pixels_equal_finite_differences(calibrator
         torch.testing.assert_close(got, expected, rtol=2e-3, atol=1e-4 * scale)
 
 
-@pytest.mark.parametrize("calibrator", [JointCalibrator(), TwoStageCalibrator()], ids=["joint", "two-stage"])
+@CALIBRATORS
 @pytest.mark.parametrize("dtype", [torch.float32, DOUBLE], ids=str)
 def test_frames_without_gradients_may_come_before_frames_with_them(calibrator, dtype):
     """Computed in inference mode, whose tensors no graph accepts, but returned as others."""

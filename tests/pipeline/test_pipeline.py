@@ -29,6 +29,7 @@ from lanebev.testing.segments import INTRINSICS as K
 from lanebev.testing.segments import lanes
 from lanebev.types import Extrinsics
 from lanebev.weights import save_segmenter
+from tests.calibrators import CALIBRATORS
 from tests.pipeline.stand_ins import (
     GRID,
     INTRINSICS,
@@ -224,7 +225,7 @@ def test_no_part_needs_a_device_with_double_precision(calibrator):
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("calibrator", [TwoStageCalibrator(), JointCalibrator()])
+@CALIBRATORS
 def test_what_is_done_to_the_output_is_not_done_to_the_state(calibrator, dtype):
     state = calibrator.initial_state(1, dtype=dtype)
     for seed in range(3):
@@ -251,7 +252,7 @@ def test_an_image_that_is_not_finite_spoils_no_other_row_and_no_gradient(value):
 
 
 @pytest.mark.parametrize("value", [float("nan"), 0.0])
-@pytest.mark.parametrize("calibrator", [TwoStageCalibrator(), JointCalibrator()])
+@CALIBRATORS
 def test_a_camera_that_cannot_be_used_spoils_no_gradient_behind_a_lens(calibrator, value):
     made, bad = small(calibrator).double(), torch.full((3, 3), value).double()
     lens = torch.tensor([[-0.1, 0.01, 0.0, 0.0]] * 2, dtype=torch.float64)
@@ -262,7 +263,7 @@ def test_a_camera_that_cannot_be_used_spoils_no_gradient_behind_a_lens(calibrato
     assert not out.segments.weight[0].any()
 
 
-@pytest.mark.parametrize("calibrator", [TwoStageCalibrator(), JointCalibrator()])
+@CALIBRATORS
 def test_cameras_of_whole_numbers_are_named(calibrator):
     with pytest.raises(ValueError, match=r"intrinsics: expected floating point, got torch.int64"):
         calibrator(lanes(), K[None].long(), calibrator.initial_state(1), 1 / 30)
@@ -293,7 +294,7 @@ def small(calibrator=None):
     return LaneBEV(net, LineExtractor.for_network(SMALL), calibrator, BEVWarp(GRID))
 
 
-@pytest.mark.parametrize("calibrator", [TwoStageCalibrator(), JointCalibrator()], ids=["two-stage", "joint"])
+@CALIBRATORS
 def test_under_autocast_the_network_alone_is_of_half_precision(calibrator):
     net, image = small(calibrator), images(1).float()
     with torch.autocast("cpu", torch.bfloat16):
@@ -305,7 +306,7 @@ def test_under_autocast_the_network_alone_is_of_half_precision(calibrator):
     assert torch.equal(out.bev, expected)
 
 
-@pytest.mark.parametrize("calibrator", [TwoStageCalibrator(), JointCalibrator()], ids=["two-stage", "joint"])
+@CALIBRATORS
 def test_calibrators_take_an_empty_batch(calibrator):
     segments = LaneSegments(*(v[:0] for v in lanes()))
     out, state = calibrator(segments, K.expand(0, 3, 3), calibrator.initial_state(0), 0.1, 3.7)

@@ -12,6 +12,7 @@ from lanebev import BEVGrid, Camera, JointCalibrator, LaneBEV, Session, Status, 
 from lanebev.estimation.joint.config import MotionConfig
 from lanebev.estimation.joint.layout import layout
 from lanebev.estimation.reasons import REASON_WORDS, Reason, describe_reasons
+from tests.calibrators import CALIBRATORS
 from tests.drawn_road import PLACES, polylines
 
 CAMERA = Camera.from_parameters(600, 600, 319.5, 179.5, 640, 360, distortion=(-0.2, 0.05, 0.0, 0.0, 0.0))
@@ -357,6 +358,6 @@ def test_every_reason_has_words():
     assert describe_reasons(all_axes | Reason.NO_SEGMENTS) == ["no lane boundaries seen"]
 
 
-@pytest.mark.parametrize("calibrator", [JointCalibrator(), TwoStageCalibrator()], ids=["joint", "two-stage"])
+@CALIBRATORS
 def test_reasons_before_the_first_frame(calibrator):
     assert calibrator.reasons(calibrator.initial_state(2)).tolist() == [Reason.NO_START] * 2
