@@ -13,6 +13,7 @@ from lightning.pytorch.utilities import rank_zero_warn
 from torch.utils.data import DataLoader, IterableDataset
 
 from lanebev.io.images.pixels import image_size, read_image
+from lanebev.io.lanes.contrast import LaneContrast
 from lanebev.io.lanes.culane import read_culane
 from lanebev.io.lanes.openlane import read_openlane
 from lanebev.io.lanes.parsing import FrameLines
@@ -23,7 +24,8 @@ from lanebev.types import NUM_BOUNDARIES
 from train.data import Batch, Seed, ViewBatches, run_position
 from train.labels import LabelledImage, ViewConfig, full_view
 
-_LOOKED_AT = 20  # entries, for the size of their images
+_LOOKED_AT = 20  # entries, for the size and the contrast of their images
+_REMEDY = "take the images that were labelled, or convert the labels to pixels of these"
 Format = Literal["tusimple", "culane", "openlane"]
 
 
@@ -78,22 +80,31 @@ def read_entries(layout: Format, root: Path, names: list[str]) -> list[Entry]:
     return entries
 
 
-def check_sizes(entries: list[Entry]) -> None:
-    """Warn if lines seem to be in pixels of smaller or cropped images, by some entries of each image size."""
+def check_labels(entries: list[Entry]) -> None:
+    """Warn if some lines seem to be of other images, or in pixels of smaller or cropped ones.
+
+    Raises:
+        ValueError: lines lie outside the images, or there are none.
+    """
+    if not any(entry.lines.lines for entry in entries):
+        raise ValueError(f"{entries[0].lines.name} and others: lanes: none of the entries has a line")
     of_size: dict[tuple[int, int], list[FrameLines]] = defaultdict(list)
-    for entry in entries[:: max(1, len(entries) // _LOOKED_AT)]:
+    contrast = LaneContrast()
+    for number, entry in enumerate(entries[:: max(1, len(entries) // _LOOKED_AT)]):
         size = image_size(entry.image)
         if size is not None:
             of_size[size].append(entry.lines)
-    for size, frames in of_size.items():
-        doubt = size_doubt(frames, size)
+            contrast.add(number, read_image(entry.image), (line.points for line in entry.lines.lines))
+    doubts = [(frames[0].name, size_doubt(frames, size)) for size, frames in of_size.items()]
+    for name, doubt in doubts:
         if doubt is None:
             continue
-        remedy = "take the images that were labelled, or convert the labels to pixels of these"
-        words = f"{frames[0].name} and others: lanes: {doubt.words} {remedy}"
+        words = f"{name} and others: lanes: {doubt.words} {_REMEDY}"
         if doubt.is_outside:
             raise ValueError(words)
         rank_zero_warn(words)
+    if (words := contrast.remark()) and not any(doubt for _, doubt in doubts):
+        rank_zero_warn(f"{entries[0].lines.name} and others: lanes: {words} {_REMEDY}")
 
 
 def _lines(path: Path) -> list[str]:
@@ -200,7 +211,7 @@ class LaneFiles(L.LightningDataModule):
     def train_dataloader(self) -> DataLoader[Batch]:
         """Return endless random views."""
         entries = read_entries(self.layout, self.root, self.train)
-        check_sizes(entries)
+        check_labels(entries)
         frames = EntryFrames(entries)
         rank, first = run_position(self)
         return DataLoader(
@@ -212,7 +223,7 @@ class LaneFiles(L.LightningDataModule):
     def val_dataloader(self) -> DataLoader[ScoredBatch]:
         """Return every image once, whole."""
         entries = read_entries(self.layout, self.root, self.val)
-        check_sizes(entries)
+        check_labels(entries)
         data = ScoredBatches(entries, self.layout, self.batch_size, self.val_size, self.view)
         return DataLoader(data, batch_size=None, collate_fn=_as_it_is)
 

@@ -12,7 +12,7 @@ from lanebev.io.lanes.parsing import FrameLines
 from lanebev.observation.polylines import BoundaryRows, LaneLine
 from train.__main__ import main
 from train.data import Batch, ViewBatches
-from train.datasets import EntryFrames, LaneFiles, ScoredBatch, check_sizes, labelled_image, read_entries
+from train.datasets import EntryFrames, LaneFiles, ScoredBatch, check_labels, labelled_image, read_entries
 from train.labels import ViewConfig
 from train.scores import DRAWN, BenchmarkScores, drawn_counts
 
@@ -205,13 +205,29 @@ def test_labels_in_pixels_of_other_images_are_noticed(root):
 
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        check_sizes(entries)
+        check_labels(entries)
     with pytest.raises(
         ValueError,
         match=r"driver/0 and others: lanes: .* of images of another size\? take the",
     ):
-        check_sizes(scaled(2.0))
+        check_labels(scaled(2.0))
     with pytest.warns(match=r"driver/0 and others: lanes: none of .*; of smaller images\? take the images"):
-        check_sizes(scaled(0.5))
+        check_labels(scaled(0.5))
     with pytest.warns(match=r"of images whose top was cut off\?"):
-        check_sizes(scaled(1.0, 70.0))
+        check_labels(scaled(1.0, 70.0))
+
+
+def test_labels_that_are_not_where_the_images_show_lines_are_noticed(root):
+    entries = 10 * read_entries("culane", root, ["list.txt"])
+
+    def moved(entry, by):
+        lines = [line._replace(points=line.points + by) for line in entry.lines.lines]
+        return entry._replace(lines=entry.lines._replace(lines=lines))
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_labels(entries)
+    with pytest.warns(match=r"driver/0 and others: lanes: images show no lines where they are; .* take the"):
+        check_labels([moved(entry, np.array([-25.0, 0.0])) for entry in entries])
+    with pytest.raises(ValueError, match="none of the entries has a line"):
+        check_labels([entry._replace(lines=entry.lines._replace(lines=[])) for entry in entries])
