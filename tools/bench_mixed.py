@@ -20,7 +20,7 @@ from jsonargparse.typing import PositiveInt
 from torch import Tensor
 
 from lanebev.estimation.joint.calibrator import JointCalibrator
-from lanebev.testing.moments import CAMERA, PLACES, WIDTH, Change, Moment, drift, observe
+from lanebev.testing.moments import CAMERA, PLACES, WIDTH, Change, Moment, observe, table1_offset
 from lanebev.testing.motions import Motion, Pose, moved, share_done, sinusoids, suspension
 from lanebev.types import Status
 from train.commands import command_parser, one_line_errors
@@ -97,7 +97,9 @@ def draw(seed: int) -> Drive:
         dt = random.uniform(0.9, 1.1) / fps
         t += dt
         tag = "start" if t < SETTLING else ""
-        moment = Moment(motion(t), 0.5 * drift(0.5 * t), visible=visible, near=near, far=far, dt=dt, tag=tag)
+        moment = Moment(
+            motion(t), 0.5 * table1_offset(0.5 * t), visible=visible, near=near, far=far, dt=dt, tag=tag
+        )
         for change in changes:
             moment = change(t, moment)
         moments.append(moment)
@@ -226,7 +228,7 @@ _CHANGES: dict[str, Callable[[Random, float], Change]] = {
 }
 
 
-def follow(drive: Drive, seed: int, calibrator: JointCalibrator) -> Errors:
+def run_drive(drive: Drive, seed: int, calibrator: JointCalibrator) -> Errors:
     """Run the calibrator on a drive."""
     state = calibrator.initial_state(1, dtype=torch.float64)
     by_sigma, nees = [torch.zeros(0, 4, dtype=torch.float64)], [torch.zeros(0, dtype=torch.float64)]
@@ -242,7 +244,7 @@ def follow(drive: Drive, seed: int, calibrator: JointCalibrator) -> Errors:
     return Errors(torch.cat(by_sigma), torch.cat(nees))
 
 
-def row(name: str, errors: Sequence[Errors]) -> str:
+def table_row(name: str, errors: Sequence[Errors]) -> str:
     """Write a row of the table. Every drive that was calibrated counts the same."""
     judged = [one for one in errors if len(one.nees)]
     if not judged:
@@ -256,16 +258,16 @@ def print_mixed(drives: int, first: int) -> None:
     """Measure the joint calibrator on drives drawn at random."""
     seeds = range(first, first + drives)
     drawn = [draw(seed) for seed in seeds]
-    found = [follow(drive, seed, JointCalibrator()) for drive, seed in zip(drawn, seeds, strict=True)]
+    found = [run_drive(drive, seed, JointCalibrator()) for drive, seed in zip(drawn, seeds, strict=True)]
     print("| drives with | drives | NEES/dof | % within 3 σ: pitch yaw roll height |\n|---|---|---|---|")
-    print(row("anything", found))
+    print(table_row("anything", found))
     for one in SHARES:
         having = [errors for errors, drive in zip(found, drawn, strict=True) if one in drive.difficulties]
-        print(row(one, having))
+        print(table_row(one, having))
     least = [float(errors.within().amin()) if len(errors.nees) else 1.0 for errors in found]
     for k in sorted(range(drives), key=least.__getitem__)[:WORST]:
         what = f"{drawn[k].words}; {', '.join(drawn[k].difficulties)}"
-        print(row(f"seed {seeds[k]}: {what}", found[k : k + 1]))
+        print(table_row(f"seed {seeds[k]}: {what}", found[k : k + 1]))
 
 
 @one_line_errors()

@@ -176,7 +176,7 @@ def carla_drive(data: Path, model: Any, calibrators: dict[str, Any]) -> Iterable
     """Evaluate the drive's straight frames 10-66 against the truth."""
     camera = Camera.from_file(data / "carla" / "camera.yaml")
     expected = carla_truth(data)["drive.mp4"]
-    drives = follow(str(data / "carla" / "drive.mp4"), camera, model, calibrators, CARLA_LANE_WIDTH)
+    drives = run_calibrators(str(data / "carla" / "drive.mp4"), camera, model, calibrators, CARLA_LANE_WIDTH)
     for name, drive in drives.items():
         error = _in_units(drive.poses[10:67] - expected).square().mean(0).sqrt()
         yield from _per_axis("carla drive 10-66", "RMSE", name, error, (0.1, 0.1, 0.2, 3))
@@ -188,7 +188,7 @@ def udacity(data: Path, model: Any, calibrators: dict[str, Any]) -> Iterable[Fig
     camera = Camera.from_file(data / "udacity" / "camera.yaml")
     for video, count in (("highway_a", 76), ("highway_b", 201)):
         path = str(data / "udacity" / f"{video}.mp4")
-        drives = follow(path, camera, model, calibrators, UDACITY_LANE_WIDTH)
+        drives = run_calibrators(path, camera, model, calibrators, UDACITY_LANE_WIDTH)
         for name, drive in drives.items():
             part = f"udacity {video}"
             yield Figure(part, "rows", name, len(drive.poses), count, least=True)
@@ -198,7 +198,7 @@ def udacity(data: Path, model: Any, calibrators: dict[str, Any]) -> Iterable[Fig
             yield from _width_figures(part, name, drive, camera, targets=True)
 
 
-def follow(
+def run_calibrators(
     source: str, camera: Camera, model: Any, calibrators: dict[str, Any], lane_width: float
 ) -> dict[str, Drive]:
     """Run every calibrator on the same observations of a video; far views are about joint's horizon."""

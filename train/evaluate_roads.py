@@ -32,7 +32,7 @@ from train.export import trained_segmenter
 from train.labels import ViewConfig
 from train.maps import boundaries_as_taken, label_maps
 from train.metrics import row_recall
-from train.rendering import drawn
+from train.rendering import combined_seed
 
 TOLERANCE = 2.5  # label px
 DISTANCES = (0.0, 10.0, 20.0, 40.0, 80.0, float("inf"))  # m
@@ -157,7 +157,7 @@ def evaluate(
         if begin + longest > deadline:
             break
         count = min(batch, views - start)
-        generator = torch.Generator().manual_seed(drawn((seed, number, start)))
+        generator = torch.Generator().manual_seed(combined_seed((seed, number, start)))
         frame = render_views(count, segmenter.image_size, generator, device=device, kind=kind)
         rows = judge_rows(segmenter(frame.image), frame, view)
         for name, mask in groups(rows, kind).items():

@@ -21,7 +21,15 @@ from lanebev.tensors import join_tensors
 from train.budget import Stage, stage_at, used_share
 from train.data import Batch, Seed, run_position
 from train.labels import ViewConfig
-from train.rendering import Scenes, Views, labelled, mirrored, rendered, sampled, shown
+from train.rendering import (
+    Scenes,
+    Views,
+    labelled,
+    mirrored,
+    random_views,
+    render_sampled,
+    sample_scenes,
+)
 from train.stopwatch import Stopwatch
 
 
@@ -98,7 +106,7 @@ class LiveBatches(IterableDataset[Batch]):
 
     def _render(self, block: int, ahead: ScenesAhead) -> Block:
         stage = self._stage(block)
-        views = shown(ahead.take(block, stage), stage.size, self.device, self.rows)
+        views = render_sampled(ahead.take(block, stage), stage.size, self.device, self.rows)
         ahead.begin(block + 1, self._stage(block + 1))
         return Block(views, self._fresh(stage))
 
@@ -113,7 +121,7 @@ class LiveBatches(IterableDataset[Batch]):
 
     def _sample(self, block: int, stage: Stage) -> Scenes:
         seed = (*self.seed, block, 1)
-        return sampled(self._fresh(stage) * self.together, stage.size, seed, self.window)
+        return sample_scenes(self._fresh(stage) * self.together, stage.size, seed, self.window)
 
 
 def far_stage(stage: Stage) -> Stage:
@@ -165,7 +173,7 @@ class HeldOutBatches(IterableDataset[Batch]):
         for number in range(self.batches):
             seed = (self.seed, number)
             yield labelled(
-                rendered(self.batch_size, self.size, seed, self.device, None, self.batch_size), self.view
+                random_views(self.batch_size, self.size, seed, self.device, None, self.batch_size), self.view
             )
 
 

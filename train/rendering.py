@@ -30,8 +30,8 @@ class Views(NamedTuple):
     visible: Tensor
 
 
-def drawn(seed: Seed) -> int:
-    """Return one number drawn by several."""
+def combined_seed(seed: Seed) -> int:
+    """Draw one seed by several numbers."""
     return int(np.random.default_rng(seed).integers(2**62))
 
 
@@ -42,21 +42,21 @@ class Scenes(NamedTuple):
     seeds: list[int]
 
 
-def sampled(count: int, size: tuple[int, int], seed: Seed, window: WindowConfig | None) -> Scenes:
-    """Sample the scenes of views, see :func:`rendered`."""
-    generator = torch.Generator().manual_seed(drawn(seed))
+def sample_scenes(count: int, size: tuple[int, int], seed: Seed, window: WindowConfig | None) -> Scenes:
+    """Sample the scenes of views, see :func:`random_views`."""
+    generator = torch.Generator().manual_seed(combined_seed(seed))
     return Scenes(*sample_views(count, size, generator, window=window))
 
 
 @torch.no_grad()
-def shown(scenes: Scenes, size: tuple[int, int], device: torch.device, rows: int) -> Views:
-    """Render sampled scenes, see :func:`rendered`."""
+def render_sampled(scenes: Scenes, size: tuple[int, int], device: torch.device, rows: int) -> Views:
+    """Render sampled scenes, see :func:`random_views`."""
     frame = render_scenes(scenes.scene, size, scenes.seeds, device=device, rows=rows)
     image = (255 * frame.image).round_().clamp_(0, 255).byte()
     return Views(image, boundaries_as_taken(frame), frame.painted > 0.5, frame.visible > 0.5)
 
 
-def rendered(
+def random_views(
     count: int,
     size: tuple[int, int],
     seed: Seed,
@@ -74,7 +74,7 @@ def rendered(
         window: window of the views; None for whole images.
         rows: views whose pixels are computed at once.
     """
-    return shown(sampled(count, size, seed, window), size, device, rows)
+    return render_sampled(sample_scenes(count, size, seed, window), size, device, rows)
 
 
 def mirrored(views: Views, which: Tensor) -> Views:

@@ -24,7 +24,7 @@ from train.commands import command_parser, one_line_errors
 from train.data import Batch
 from train.labels import ViewConfig
 from train.module import Segmentation, unpack
-from train.rendering import labelled, rendered
+from train.rendering import labelled, random_views
 
 _HIDDEN = (255.0, 255.0, 255.0)
 _OPACITY = 0.7
@@ -113,12 +113,12 @@ def main() -> None:
         report(
             "rendering",
             count,
-            partial(rendered, count, size, (count,), device, window, count),
+            partial(random_views, count, size, (count,), device, window, count),
             device,
             repeats,
         )
     count = args.batches[len(args.batches) // 2]
-    views = rendered(count, size, (1,), device, window, min(args.batches))
+    views = random_views(count, size, (1,), device, window, min(args.batches))
     report("labelling", count, lambda: labelled(views, view), device, repeats)
     batch = labelled(views, view)
     save_sheet(labelled_view(type(batch)(*(field[:24] for field in batch))), args.out / "sheet.png")

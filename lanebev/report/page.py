@@ -26,7 +26,7 @@ from lanebev.report.axis_states import (
 )
 from lanebev.report.figures import bokeh_script
 from lanebev.report.lens_table import lens_table
-from lanebev.report.moments import Jpegs
+from lanebev.report.pictures import Jpegs
 from lanebev.report.plots import plot_estimates, plot_widths, width_deviation, width_limits
 from lanebev.report.templates import template
 from lanebev.report.timeline import STATE_WORDS, places_on_axis, shown_frames, strips, ticks
@@ -46,7 +46,7 @@ class Report:
         after: (F, L-1) m, with the estimated pose.
         lane_width: m, assumed.
         facts: what ran, label to value.
-        moments: pictures of some frames by place of their row: "image", "before" and "after" as JPEG.
+        pictures: pictures of some frames by place of their row: "image", "before" and "after" as JPEG.
         problems: frames that did not decode and the like, one line each.
         is_stills: each image on its own.
         is_smoothed: each pose from the whole drive.
@@ -62,7 +62,7 @@ class Report:
     after: NDArray[np.float64]
     lane_width: float
     facts: Mapping[str, str]
-    moments: Mapping[int, Jpegs] = field(default_factory=dict)
+    pictures: Mapping[int, Jpegs] = field(default_factory=dict)
     problems: Sequence[str] = field(default_factory=list)
     is_stills: bool = False
     is_smoothed: bool = False
@@ -91,7 +91,7 @@ def page_context(report: Report) -> dict[str, Any]:
     found = verdict(rows, stills)
     worst = [] if stills else worst_moments(rows)
     edges = places_on_axis(rows, stills)
-    places = shown_frames(rows, [*report.moments, *(moment.place for moment in worst)])
+    places = shown_frames(rows, [*report.pictures, *(moment.place for moment in worst)])
     several = len(rows) > 1
     return {
         "title": report.title,
@@ -142,7 +142,7 @@ def page_data(report: Report, places: Sequence[int], edges: NDArray[np.float64])
         "stills": report.is_stills,
         "pictures": {
             str(place): {name: data_uri(data) for name, data in pictures.items()}
-            for place, pictures in report.moments.items()
+            for place, pictures in report.pictures.items()
         },
     }
 

@@ -55,7 +55,7 @@ Change = Callable[[float, Moment], Moment]
 """Changes the moment at a time in s."""
 
 
-def swing(t: float) -> tuple[float, float, float, float]:
+def table1_pose(t: float) -> tuple[float, float, float, float]:
     """Return the motion of the Table I experiment: ±1.5° pitch and yaw, ±1° roll, ±5 cm, up to 1 Hz."""
     turn = 2 * math.pi * t
     return (
@@ -66,7 +66,7 @@ def swing(t: float) -> tuple[float, float, float, float]:
     )
 
 
-def drift(t: float) -> float:
+def table1_offset(t: float) -> float:
     """Return the lateral offset of the same experiment, m."""
     return -0.4 * math.sin(0.3 * math.pi * t + 0.5)
 
@@ -74,7 +74,7 @@ def drift(t: float) -> float:
 def moments(
     seconds: float,
     change: Change | None = None,
-    motion: Motion = swing,
+    motion: Motion = table1_pose,
     fps: float = FPS,
     start: float = 0.0,
 ) -> list[Moment]:
@@ -82,7 +82,7 @@ def moments(
     drive = []
     for k in range(round(seconds * fps)):
         t = start + k / fps
-        moment = Moment(motion(t), drift(t), dt=1 / fps)
+        moment = Moment(motion(t), table1_offset(t), dt=1 / fps)
         drive.append(change(t, moment) if change else moment)
     return drive
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from lanebev.testing.moments import FPS, PLACES, WIDTH, Change, Moment, drift, swing
+from lanebev.testing.moments import FPS, PLACES, WIDTH, Change, Moment, table1_offset, table1_pose
 from lanebev.testing.motions import share_done
 
 
@@ -89,7 +89,7 @@ def _clock(t: float, moment: Moment) -> Moment:
     k = round(t * FPS)
 
     def at(frame: int) -> Moment:
-        return Moment(swing(frame / FPS), drift(frame / FPS))
+        return Moment(table1_pose(frame / FPS), table1_offset(frame / FPS))
 
     ten, phase = k // 10 * 9, k % 10  # nine true frames in ten: one twice, one late, one missing
     true = ten + (0, 1, 2, 2, 3, 3, 4, 5, 6, 8)[phase]

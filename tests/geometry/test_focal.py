@@ -9,7 +9,7 @@ from lanebev import Extrinsics, JointCalibrator, LaneSegments, image_from_road_p
 from lanebev.estimation.joint.measurement.observations import observe
 from lanebev.estimation.joint.measurement.residuals import boundary_residuals
 from lanebev.geometry.focal import focal_covariance, pose_by_log_focal
-from lanebev.testing.moments import CAMERA, moments, swing
+from lanebev.testing.moments import CAMERA, moments, table1_pose
 from lanebev.testing.moments import observe as see
 from tools.focal_information import frame_information
 
@@ -113,7 +113,7 @@ def test_focal_lengths_drawn_from_their_sigma_leave_errors_as_large_as_the_covar
     calibrator = JointCalibrator()
     state = calibrator.initial_state(rows, dtype=torch.float64)
     mount = (math.radians(3), math.radians(-2), math.radians(1), 0.0)
-    drive = moments(0.3, motion=lambda t: tuple(map(sum, zip(swing(t), mount, strict=True))))
+    drive = moments(0.3, motion=lambda t: tuple(map(sum, zip(table1_pose(t), mount, strict=True))))
     for moment, segments in see(drive, rows, 1.0, 8, 0, torch.float64):
         calibration, state = calibrator(segments, assumed, state, moment.dt, 3.7)
     error = calibration.extrinsics.stack() - torch.tensor(moment.pose, dtype=torch.float64)

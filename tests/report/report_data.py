@@ -8,8 +8,8 @@ import torch
 from lanebev import Camera
 from lanebev.estimation.mount import MountEstimator
 from lanebev.io.results import ExtrinsicsRow
-from lanebev.report.moments import jpeg
 from lanebev.report.page import Report
+from lanebev.report.pictures import jpeg
 
 FPS, FRAMES, KNOCK = 20, 240, 200
 ALL_UNSEEN = "ROLL_UNSEEN|HEIGHT_UNSEEN|DIRECTION_UNSEEN"
@@ -76,7 +76,7 @@ def eventful_report(title="drive.mp4", **changes):
         "after": after,
         "lane_width": 3.7,
         "facts": {"source": title, "lane width": "3.7 m"},
-        "moments": {
+        "pictures": {
             i: {"image": jpeg(picture(i)), "after": jpeg(picture(i, (72, 24)))} for i in range(0, FRAMES, 20)
         },
         "problems": ["frame 130: cannot be decoded"],

@@ -11,8 +11,8 @@ import pytest
 
 from lanebev import Camera
 from lanebev.report.lens_table import lens_table
-from lanebev.report.moments import MomentSampler, jpeg
 from lanebev.report.page import Report, write_report
+from lanebev.report.pictures import PictureSampler, jpeg
 from lanebev.report.plots import plot_estimates, plot_widths, width_deviation, width_limits
 from lanebev.report.timeline import places_on_axis, shown_frames, strips
 from lanebev.report.worst import jumps, scores, worst_moments
@@ -130,12 +130,12 @@ def test_the_page_stays_small(tmp_path):
     """Ten hours of video at 30 frames a second make a page that a mail takes."""
     first = eventful_rows()
     many = [first[i % FRAMES]._replace(frame=i, time_s=i / 30) for i in range(30_000)]
-    sampler = MomentSampler(most_bytes=200_000)
+    sampler = PictureSampler(most_bytes=200_000)
     noise = np.random.default_rng(0).integers(0, 255, (90, 160, 3), dtype=np.uint8)
     for i in range(0, 30_000, 50):
         sampler.add(i, {"image": noise}, {})
     widths = np.full((30_000, 5), 3.7)
-    report = eventful_report(rows=many, before=widths, after=widths, moments=sampler.moments)
+    report = eventful_report(rows=many, before=widths, after=widths, pictures=sampler.pictures)
     assert len(_page(tmp_path, report).encode()) < 1_300_000 + 270_000 + 1_600_000  # Bokeh, pictures, numbers
 
 
@@ -170,12 +170,12 @@ def test_a_quiet_drive_has_no_jumps():
 
 
 def test_sampler_covers_the_drive_and_keeps_the_best():
-    sampler = MomentSampler(most_bytes=40 * len(jpeg(picture(0))))
+    sampler = PictureSampler(most_bytes=40 * len(jpeg(picture(0))))
     for i in range(1000):
         sampler.add(
             i, {"image": picture(i)}, {"jump": float(i == 501), "late": 0.0 if i < 700 else 1000.0 - i}
         )
-    kept = list(sampler.moments)
+    kept = list(sampler.pictures)
     assert {501, 700} <= set(kept)
     even = [i for i in kept if i not in (501, 700)]
     assert 15 < len(even) <= 40
@@ -184,10 +184,10 @@ def test_sampler_covers_the_drive_and_keeps_the_best():
 
 
 def test_sampler_gives_up_no_best_picture_for_room():
-    sampler = MomentSampler(most_bytes=1)
+    sampler = PictureSampler(most_bytes=1)
     sampler.add(3, {"image": picture(3)}, {"jump": 2.0})
     sampler.add(5, {"image": picture(5)}, {"jump": 1.0})
-    assert list(sampler.moments) == [3]
+    assert list(sampler.pictures) == [3]
 
 
 def test_pictures_are_scaled_down():

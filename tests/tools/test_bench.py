@@ -12,7 +12,7 @@ from lanebev.testing.moments import WIDTH
 from tools.bench_calibration import main, smallest_eigenvalue, stream
 from tools.bench_kinds import ALLOWED, FIRST_SEED, measure
 from tools.bench_mixed import FIRST_SEED as FIRST_MIXED
-from tools.bench_mixed import draw, follow, row
+from tools.bench_mixed import draw, run_drive, table_row
 
 
 @pytest.mark.slow
@@ -86,10 +86,10 @@ def test_drives_drawn_at_random_are_the_same_for_a_seed_and_change_lanes_without
 def test_a_drive_drawn_at_random_is_calibrated_and_its_row_has_the_shares():
     drive = draw(FIRST_MIXED)
     short = replace(drive, moments=drive.moments[: len(drive.moments) // 8])
-    errors = follow(short, FIRST_MIXED, JointCalibrator())
+    errors = run_drive(short, FIRST_MIXED, JointCalibrator())
     evaluated = [moment for moment in short.moments if not moment.tag]
     assert 0 < len(errors.nees) <= len(evaluated)
     assert (errors.within() > 0.9).all()
     wrong = errors._replace(by_sigma=torch.tensor([[0.0, 2.9, 3.1, 9.0]]), nees=torch.tensor([2.0]))
-    assert row("one", [wrong]) == "| one | 1 | 2.00 | 100.0 100.0 0.0 0.0 |"
-    assert row("none", []) == "| none | 0 | – | – |"
+    assert table_row("one", [wrong]) == "| one | 1 | 2.00 | 100.0 100.0 0.0 0.0 |"
+    assert table_row("none", []) == "| none | 0 | – | – |"

@@ -11,7 +11,7 @@ import torch
 from lanebev.pipeline import LaneBEV
 from lanebev.types import Extrinsics
 from lanebev.view.grid import BEVGrid
-from train.detector.__main__ import main, trained
+from train.detector.__main__ import main, train_arm
 from train.detector.drives import (
     MOUNT_ERROR,
     NOMINAL,
@@ -212,13 +212,13 @@ def weights(module):
 @pytest.mark.slow
 def test_the_tuned_arm_differs_from_the_online_one_by_the_lane_networks_training_alone(folder, tmp_path):
     frames = DriveFrames(folder, GRID)
-    online = weights(trained(small(folder, tmp_path), "online", 1, frames))
-    still = trained(small(folder, tmp_path, lane_rate=1e-12), "tuned", 1, frames)
+    online = weights(train_arm(small(folder, tmp_path), "online", 1, frames))
+    still = train_arm(small(folder, tmp_path, lane_rate=1e-12), "tuned", 1, frames)
     for name, part in weights(still).items():
         torch.testing.assert_close(part, online[name], atol=1e-4, rtol=1e-4)
     before = LaneBEV.from_pretrained(network_width=160).segmenter.state_dict()
     (tmp_path / "tuned-1/last.ckpt").unlink()
-    moved = trained(small(folder, tmp_path, lane_rate=1e-4), "tuned", 1, frames)
+    moved = train_arm(small(folder, tmp_path, lane_rate=1e-4), "tuned", 1, frames)
     assert moved.trainer.global_step == 4
     change = {name: part - before[name] for name, part in moved.lanes.segmenter.state_dict().items()}
     assert 1e-6 < max(float(each.abs().max()) for each in change.values()) < 2.1e-4
@@ -228,9 +228,9 @@ def test_the_tuned_arm_differs_from_the_online_one_by_the_lane_networks_training
 @pytest.mark.slow
 def test_an_interrupted_training_ends_as_one_without_interruption(folder, tmp_path):
     frames = DriveFrames(folder, GRID)
-    whole = weights(trained(small(folder, tmp_path), "noisy", 1, frames))
+    whole = weights(train_arm(small(folder, tmp_path), "noisy", 1, frames))
     (tmp_path / "noisy-1/step=2.ckpt").rename(tmp_path / "noisy-1/last.ckpt")
-    again = weights(trained(small(folder, tmp_path), "noisy", 1, frames))
+    again = weights(train_arm(small(folder, tmp_path), "noisy", 1, frames))
     for name, part in again.items():
         torch.testing.assert_close(part, whole[name], atol=0, rtol=0)
 

@@ -18,7 +18,7 @@ from train.budget import Stage, rate_factor, stage_at, used_share
 from train.labels import ViewConfig, separated
 from train.live import HeldOutBatches, LiveBatches, LiveRoads, ScenesAhead, far_stage
 from train.module import Segmentation
-from train.rendering import Views, drawn, labelled, mirrored, rendered
+from train.rendering import Views, combined_seed, labelled, mirrored, random_views
 from train.stopwatch import Stopwatch
 
 pytestmark = pytest.mark.filterwarnings("ignore")  # of Lightning about itself
@@ -29,7 +29,7 @@ STAGES = [Stage(0.5, (48, 80), 4), Stage(1.0, (64, 96), 2)]
 
 @pytest.fixture(scope="module")
 def views():
-    return rendered(2, (64, 96), (5,), CPU, WindowConfig(), 64)
+    return random_views(2, (64, 96), (5,), CPU, WindowConfig(), 64)
 
 
 @pytest.fixture
@@ -44,8 +44,8 @@ def instant(monkeypatch):
         there = torch.ones(count, 6, 12, dtype=torch.bool)
         return Views(image, points, there, there)
 
-    monkeypatch.setattr(train.live, "sampled", lambda count, _, seed, __: (count, drawn(seed)))
-    monkeypatch.setattr(train.live, "shown", noise)
+    monkeypatch.setattr(train.live, "sample_scenes", lambda count, _, seed, __: (count, combined_seed(seed)))
+    monkeypatch.setattr(train.live, "render_sampled", noise)
 
 
 def batches(first, repeats=2, flip=0.5):
@@ -254,7 +254,7 @@ def test_a_share_of_the_blocks_are_far_views_with_as_many_pixels(instant):
 @pytest.mark.slow
 def test_far_views_show_the_road_about_the_horizon():
     far = far_stage(Stage(1.0, (192, 320), 1))
-    views = rendered(4, far.size, (8,), CPU, WindowConfig(scale=(0.7, 0.7), horizon=(0.1, 0.3)), 64)
+    views = random_views(4, far.size, (8,), CPU, WindowConfig(scale=(0.7, 0.7), horizon=(0.1, 0.3)), 64)
     assert views.image.shape == (4, 3, 64, 320)
     inside = (views.points >= 0).all(-1) & (views.points[..., 1] < 64) & (views.points[..., 0] < 320)
     assert (inside & views.painted).any(-1).sum() >= 8, "expected boundaries in view"

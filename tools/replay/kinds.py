@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import torch
 
 from lanebev.camera.model import Camera
-from lanebev.testing.moments import PLACES, Change, Moment, moments, swing
+from lanebev.testing.moments import PLACES, Change, Moment, moments, table1_pose
 from lanebev.testing.motions import (
     MOUNT,
     Motion,
@@ -62,7 +62,7 @@ _CUT_AT, _MOVED_AT = 2.0, 20.0  # s
 
 def _drive(
     change: Change | None = None,
-    motion: Motion = swing,
+    motion: Motion = table1_pose,
     fps: float = 30.0,
     start: float = 0.0,
 ) -> Callable[[], list[Moment]]:

@@ -105,7 +105,7 @@ class ShockedDrive(Drive):
         return Extrinsics(*(value + more for value, more in zip(pose, self.shock.pose(time), strict=True)))
 
 
-def see(rendered: Rendered) -> dict[str, Any]:
+def detected_vertices(rendered: Rendered) -> dict[str, Any]:
     """Render a drive and run the shipped network on it: the content of the drive's file."""
     drive = ShockedDrive(rendered.seed, SIZE, FRAMES, FPS, kind=rendered.world)
     drive.shock = rendered.shock
@@ -162,7 +162,7 @@ def main(arguments: list[str] | None = None) -> int:
         raise ValueError(f"name: expected some of {', '.join(RENDERED)}, got {', '.join(unknown)}")
     DRIVES.mkdir(parents=True, exist_ok=True)
     for name in args.names or RENDERED:
-        np.savez_compressed(DRIVES / f"{name}.npz", **see(RENDERED[name]))
+        np.savez_compressed(DRIVES / f"{name}.npz", **detected_vertices(RENDERED[name]))
         print(f"wrote {name}.npz, {(DRIVES / f'{name}.npz').stat().st_size / 1024:.0f} KiB", flush=True)
     return 0
 

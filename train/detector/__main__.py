@@ -20,14 +20,14 @@ from train.detector.arms import begun_checkpoint, checkpoint_step, test_poses
 from train.detector.frames import DriveFrames, StepBatches
 from train.detector.module import DetectorTraining
 from train.detector.precision import Centres, score_range
-from train.detector.predict import find, offset_poses, pose_rmse, true_centres
+from train.detector.predict import find_vehicles, offset_poses, pose_rmse, true_centres
 from train.detector.settings import ARMS, Arm, Experiment, experiment_of, experiment_parser
 
 RANGES = ((5.0, 53.0), (5.0, 20.0), (20.0, 35.0), (35.0, 53.0))
 """m ahead; the first is all of it."""
 
 
-def trained(experiment: Experiment, arm: Arm, seed: int, frames: DriveFrames) -> DetectorTraining:
+def train_arm(experiment: Experiment, arm: Arm, seed: int, frames: DriveFrames) -> DetectorTraining:
     """Train an arm, or go on with it from its last checkpoint; "tuned" continues "online"."""
     L.seed_everything(seed, verbose=False)
     module, steps = DetectorTraining(experiment, arm, seed), int(experiment.steps)
@@ -67,12 +67,12 @@ def scores(found: Centres, truth: Centres) -> list[dict[str, Any]]:
     return [{"range": span, **score_range(found, truth, *span)._asdict()} for span in RANGES]
 
 
-def tested(experiment: Experiment, module: DetectorTraining, frames: DriveFrames) -> dict[str, Any]:
+def evaluate_arm(experiment: Experiment, module: DetectorTraining, frames: DriveFrames) -> dict[str, Any]:
     """Test an arm; "true" also with poses that are off by known angles."""
     poses = test_poses(experiment, module, frames)
     offsets = offset_poses(poses) if module.arm == "true" else {}
     truth = true_centres(frames.frames)
-    exact, *off = find(module.detector, frames.frames, [poses, *offsets.values()])
+    exact, *off = find_vehicles(module.detector, frames.frames, [poses, *offsets.values()])
     result: dict[str, Any] = {
         "arm": module.arm,
         "frames": len(frames),
@@ -97,8 +97,8 @@ def run(experiment: Experiment) -> None:
             if path.exists():
                 continue
             begun = time.perf_counter()
-            module = trained(experiment, arm, seed, train)
-            result = {"seed": seed, **tested(experiment, module, test)}
+            module = train_arm(experiment, arm, seed, train)
+            result = {"seed": seed, **evaluate_arm(experiment, module, test)}
             result |= {"train_frames": len(train), "seconds": round(time.perf_counter() - begun)}
             result["settings"] = {name: str(value) for name, value in asdict(experiment).items()}
             with whole_file(path) as whole:

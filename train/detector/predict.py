@@ -21,7 +21,7 @@ _COLUMN = {"pitch": 0, "yaw": 1, "roll": 2}
 
 
 @torch.inference_mode()
-def find(detector: VehicleDetector, frames: Frames, poses: Sequence[Tensor]) -> list[Centres]:
+def find_vehicles(detector: VehicleDetector, frames: Frames, poses: Sequence[Tensor]) -> list[Centres]:
     """Find vehicles in all frames by each of several poses; image features are computed once.
 
     Args:

@@ -33,7 +33,7 @@ def read_results(folder: Path) -> Results:
     return {arm: each for arm, each in results.items() if each}
 
 
-def won_back(arm: Sequence[float], nominal: Sequence[float], true: Sequence[float]) -> float:
+def recovered_share(arm: Sequence[float], nominal: Sequence[float], true: Sequence[float]) -> float:
     """Compute the share of what ``nominal`` loses against ``true`` that ``arm`` does not, of their means."""
     low, high = float(np.mean(nominal)), float(np.mean(true))
     return (float(np.mean(arm)) - low) / (high - low) if high != low else float("nan")
@@ -67,7 +67,7 @@ def arm_table(results: Results) -> list[str]:
         share = "–"
         if {"nominal", "true"} <= results.keys() and arm not in ("nominal", "true"):
             low, high = (precision_of(results[name], 0, 1.0) for name in ("nominal", "true"))
-            share = f"{100 * won_back(precision_of(own, 0, 1.0), low, high):.0f} %"
+            share = f"{100 * recovered_share(precision_of(own, 0, 1.0), low, high):.0f} %"
         pose = np.mean([result["pose_rmse"] for result in own], axis=0)
         shown = " ".join(f"{value:.2f}" for value in pose)
         lines.append(f"| {NAMES[arm]} | {' | '.join(ap)} | {share} | {shown} |")

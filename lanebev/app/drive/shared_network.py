@@ -62,10 +62,10 @@ class SharedNetwork:
             self._waiting.append(own)
         with self._looking:
             if not own.answer.done():
-                self._look(self._taken(own))
+                self._run(self._take_batch(own))
         return own.answer.result()
 
-    def _taken(self, own: _Request) -> list[_Request]:
+    def _take_batch(self, own: _Request) -> list[_Request]:
         """Remove this frame, and as many others like it as a batch holds, from the list."""
         with self._changing:
             alike = [each for each in self._waiting if each is not own and each.is_like(own)]
@@ -74,7 +74,7 @@ class SharedNetwork:
         return taken
 
     @torch.inference_mode()
-    def _look(self, requests: list[_Request]) -> None:
+    def _run(self, requests: list[_Request]) -> None:
         """Run the network on frames in one batch; if that fails, on each alone: only bad ones fail."""
         try:
             points = [each.point for each in requests if each.point is not None]
@@ -85,7 +85,7 @@ class SharedNetwork:
                 requests[0].answer.set_exception(error)
                 return
             for each in requests:
-                self._look([each])
+                self._run([each])
             return
         self.batches, self.frames = self.batches + 1, self.frames + len(requests)
         for row, each in enumerate(requests):

@@ -33,9 +33,9 @@ from lanebev.io.results import ExtrinsicsRow, extrinsics_row, write_extrinsics
 from lanebev.io.video.writer import VideoWriter
 from lanebev.report.lane_curves import lane_curves
 from lanebev.report.measure import measure_boundaries, select_inliers
-from lanebev.report.moments import MomentSampler
 from lanebev.report.overlay import Panel, draw_panels, joined
 from lanebev.report.page import Report, summary_facts, write_report
+from lanebev.report.pictures import PictureSampler
 from lanebev.report.run_folder import FIRST_NUMBER
 from lanebev.report.verdict import reason_words
 from lanebev.report.worst import EventScores
@@ -108,7 +108,7 @@ class Recorder:
         self._covariances = StoredNumbers(4, 4, folder=self.path("."))
         self._first_number: int | None = None
         self._widths = StoredNumbers(2, NUM_BOUNDARIES - 1, folder=self.path("."))
-        self._moments, self._scores = MomentSampler(), EventScores()
+        self._pictures, self._scores = PictureSampler(), EventScores()
         self._repeats, self._views = RepeatedFrames(self.path(".")), ViewChanges()
         self._contrast = LaneContrast()
 
@@ -172,7 +172,7 @@ class Recorder:
             after=after,
             lane_width=self.lane_width,
             facts=facts,
-            moments=self._moments.moments,
+            pictures=self._pictures.pictures,
             problems=[*filter(None, remarks), *self.problems],  # those of frames last
             is_stills=self.stills,
             is_smoothed=self.smoothed,
@@ -202,7 +202,7 @@ class Recorder:
         panels = self._panels(done, tuple(views.values()))
         names = ["image", *views]
         number = done.frame.number
-        self._moments.add(number, dict(zip(names, panels, strict=True)), self._scores(self.rows[number]))
+        self._pictures.add(number, dict(zip(names, panels, strict=True)), self._scores(self.rows[number]))
         self._write_pictures(done.frame, views["after"].bev, joined(panels))
 
     def _lane_widths(self, estimate: Estimate, before: Extrinsics | None) -> NDArray[np.float64]:

@@ -106,7 +106,7 @@ class MountEstimator(nn.Module):
         elapsed = torch.where(interval.isfinite() & (interval > 0), interval, 0.0).unsqueeze(-1)  # (B, 1)
         state = add_frame(state, used, pose, variance, elapsed, cfg.block_time)
         doubtful = (frame_why == 0).unsqueeze(-1) & known & ~sure
-        state = self._weigh_doubtful(state, doubtful, used, pose, variance, elapsed)
+        state = self._time_contradictions(state, doubtful, used, pose, variance, elapsed)
         shown_before, *_ = self._estimate(state)
         state, moved = self._close_blocks(state)
         state, withdrawn = self._withdraw(state, moved)
@@ -117,14 +117,14 @@ class MountEstimator(nn.Module):
         )
 
         mean, var, count = self._estimate(state)
-        status, of_axes = self._judge(state, mean, count, moved, withdrawn)
+        status, of_axes = self._axis_status(state, mean, count, moved, withdrawn)
         why = why | of_axes
         state = state._replace(status=status, reasons=why)
 
         shown = state.blend * state.former + (1 - state.blend) * mean
         var = var + (shown - mean).square()  # the part of the change that is not yet blended in
         progress = 100 * (count / cfg.needed).clamp(max=1.0)
-        return _answer(shown, var, status, progress, why), state
+        return _mount_calibration(shown, var, status, progress, why), state
 
     def _frame_gates(
         self,
@@ -152,7 +152,7 @@ class MountEstimator(nn.Module):
         least = constant(self.config.moved_least, scatter)
         return torch.maximum(least, self.config.moved_sigmas * (scatter + noise).sqrt())
 
-    def _weigh_doubtful(
+    def _time_contradictions(
         self,
         state: MountState,
         doubtful: Tensor,
@@ -256,7 +256,7 @@ class MountEstimator(nn.Module):
             some,
         )
 
-    def _judge(
+    def _axis_status(
         self, state: MountState, mean: Tensor, count: Tensor, moved: Tensor, withdrawn: Tensor
     ) -> tuple[Tensor, Tensor]:
         """Return the status of every axis, and the flags of the reasons for it, (B, 4) int64 each."""
@@ -281,7 +281,7 @@ class MountEstimator(nn.Module):
         return broken * flags, broken
 
 
-def _answer(
+def _mount_calibration(
     pose: Tensor, variance: Tensor, status: Tensor, progress: Tensor, why: Tensor
 ) -> MountCalibration:
     """Summarise the axes: calibrated if all are, otherwise the most severe status of any."""

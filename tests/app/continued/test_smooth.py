@@ -19,7 +19,7 @@ from lanebev.cli import main
 from lanebev.estimation.joint.calibrator import JointCalibrator
 from lanebev.io.state import load_state
 from lanebev.io.video.writer import VideoWriter
-from lanebev.testing.moments import swing
+from lanebev.testing.moments import table1_pose
 from tests.drawn_road import PLACES, boundary, on_rows
 
 HEIGHT, WIDTH, FRAMES, FPS = 240, 416, 20, 25
@@ -34,7 +34,7 @@ def lane_lines():
     z = torch.logspace(0.6, 1.8, 40, dtype=torch.float64)
     lines = []
     for k in range(FRAMES):
-        pose = Extrinsics.from_values(*swing(k / FPS))
+        pose = Extrinsics.from_values(*table1_pose(k / FPS))
         rows = list(range(HEIGHT // 2, HEIGHT, 6))
         lanes = [on_rows(boundary(CAMERA, place, z, pose), rows, WIDTH, noise) for place in PLACES]
         fields = {
@@ -94,7 +94,7 @@ def runs(data, tmp_path_factory):
 
 @pytest.mark.slow
 def test_errors_and_sigmas_get_smaller_and_the_filters_rows_stay(runs):
-    truth = np.array([swing(k / FPS) for k in range(FRAMES)]) * [*[180 / np.pi] * 3, 1]
+    truth = np.array([table1_pose(k / FPS) for k in range(FRAMES)]) * [*[180 / np.pi] * 3, 1]
     filtered, smoothed = poses(runs / "smooth" / "filtered.csv"), poses(runs / "smooth" / "extrinsics.csv")
     assert (runs / "smooth" / "filtered.csv").read_bytes() == (runs / "plain" / "extrinsics.csv").read_bytes()
     before, after = (np.sqrt(((found[:, :4] - truth) ** 2)[2:-2].mean(0)) for found in (filtered, smoothed))

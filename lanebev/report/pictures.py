@@ -16,7 +16,7 @@ Jpegs = Mapping[str, bytes]
 
 
 @dataclass
-class MomentSampler:
+class PictureSampler:
     """Keeps pictures of evenly spaced frames, and of the frame with the highest score of each kind.
 
     When all together are larger than allowed, every second of the evenly spaced ones is dropped, so that the
@@ -42,7 +42,7 @@ class MomentSampler:
             self._thin()
 
     @property
-    def moments(self) -> dict[int, Jpegs]:
+    def pictures(self) -> dict[int, Jpegs]:
         """The kept pictures by number of the frame, in order."""
         return {number: self._kept[number] for number in sorted(self._kept)}
 
