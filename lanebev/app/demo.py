@@ -10,7 +10,7 @@ import torch
 
 from lanebev.app.concurrency import Background
 from lanebev.app.config import RunConfig
-from lanebev.app.progress import Progress
+from lanebev.app.progress import Progress, no_progress
 from lanebev.app.run import run
 from lanebev.app.summary import summary
 from lanebev.io.lanes.tusimple import tusimple_line
@@ -28,7 +28,7 @@ _RENDERED_CRF = 16  # nearly as rendered
 ProgressOf = Callable[[str], Progress]
 
 
-def demo(out: str, progress: ProgressOf | None = None) -> str:
+def demo(out: str, progress: ProgressOf = lambda _: no_progress) -> str:
     """Render a drive into ``out/drive``, run on it, and compare with the truth.
 
     Args:
@@ -41,14 +41,14 @@ def demo(out: str, progress: ProgressOf | None = None) -> str:
     drive = Drive(SEED, IMAGE_SIZE, FRAMES, float(FPS))
     folder = Path(out) / "drive"
     with OutputFolder(folder) as inside:
-        truth, lane_width = write_drive(drive, inside.__truediv__, progress and progress("rendering"))
+        truth, lane_width = write_drive(drive, inside.__truediv__, progress("rendering"))
     config = RunConfig(str(folder / "drive.mp4"), str(folder / "camera.yaml"), out, lane_width)
-    report = run(config, progress and progress("calibrating"), truth)
+    report = run(config, progress("calibrating"), truth)
     return "\n".join([summary(report, config), against_truth(report.rows, truth)])
 
 
 def write_drive(
-    drive: Drive, path: Callable[[str], Path], progress: Progress | None = None
+    drive: Drive, path: Callable[[str], Path], progress: Progress = no_progress
 ) -> tuple[list[ExtrinsicsRow], float]:
     """Render a drive to ``drive.mp4``, ``camera.yaml``, ``truth.csv`` and ``lanes.json``.
 
@@ -64,7 +64,7 @@ def write_drive(
     rows, widths, lines = [], [], []
     drive.camera.to_file(path("camera.yaml"))
     with VideoWriter(path("drive.mp4"), Fraction(FPS), _RENDERED_CRF) as video, Background() as background:
-        for number in progress(numbers, len(drive)) if progress else numbers:
+        for number in progress(numbers, len(drive)):
             frame = drive.frame(number)
             background.submit(partial(video.write, image_bytes(frame.image[0])))
             rows.append(_truth_row(number, float(drive.times[number]), frame))

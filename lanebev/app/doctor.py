@@ -12,7 +12,7 @@ import torch
 from lanebev.app.config import RunConfig
 from lanebev.app.drive.build import make_observer, make_tracker
 from lanebev.app.drive.sources import camera_of, make_source
-from lanebev.app.progress import Progress
+from lanebev.app.progress import Progress, no_progress
 from lanebev.app.recording.plausibility import pose_remark, pose_words
 from lanebev.camera.model import Camera
 from lanebev.camera.plausibility import (
@@ -67,7 +67,7 @@ class Sample:
     poses: list[list[float]] = field(default_factory=list)
 
 
-def doctor(config: RunConfig, progress: Progress | None = None) -> tuple[str, int]:
+def doctor(config: RunConfig, progress: Progress = no_progress) -> tuple[str, int]:
     """Check a source and its camera.
 
     Returns:
@@ -94,9 +94,7 @@ def doctor(config: RunConfig, progress: Progress | None = None) -> tuple[str, in
     return "\n".join([*lines, f"{without_login(config.source)}: {verdict}"]), level
 
 
-def sample_frames(
-    config: RunConfig, source: FrameSource, camera: Camera, progress: Progress | None
-) -> Sample:
+def sample_frames(config: RunConfig, source: FrameSource, camera: Camera, progress: Progress) -> Sample:
     """Run the network on some single frames: the first ones of a stream, else evenly spread ones."""
     count = _SAMPLED if source.is_live else min(source.count, round(_SECONDS * float(source.fps)))
     every = 1 if source.is_live else max(1, count // _SAMPLED)
@@ -106,7 +104,7 @@ def sample_frames(
     sample, nominal = Sample(), every / float(source.fps)
     frames = islice(source, _SAMPLED + 1)
     with torch.inference_mode():
-        for frame in progress(frames, min(count, _SAMPLED)) if progress else frames:
+        for frame in progress(frames, min(count, _SAMPLED)):
             sample.undecoded += frame.image is None
             if frame.number:
                 sample.steps.append(frame.dt / nominal)

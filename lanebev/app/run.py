@@ -34,7 +34,7 @@ from lanebev.app.drive.build import (
 from lanebev.app.drive.observers import Observation, Observer
 from lanebev.app.drive.shared_network import SharedNetwork
 from lanebev.app.drive.sources import camera_of, ended_by_signals, first_image, make_source, observed_frames
-from lanebev.app.progress import Progress
+from lanebev.app.progress import Progress, no_progress
 from lanebev.app.recording.plausibility import bars_remark, mount_remark, unfit_mount_remark
 from lanebev.app.recording.recorder import Recorded, Recorder
 from lanebev.app.summary import mount_facts, run_facts
@@ -60,7 +60,7 @@ logger = logging.getLogger(__name__)
 
 def run(
     config: RunConfig,
-    progress: Progress | None = None,
+    progress: Progress = no_progress,
     truth: Sequence[ExtrinsicsRow] | None = None,
     network: SharedNetwork | None = None,
     parts: Sequence[Path] = (),
@@ -97,7 +97,7 @@ def run(
     with OutputFolder(config.out) as out, torch.inference_mode():
         if config.resume and problem:
             problem += backup_state(config.resume, out)
-        progress = None if source.is_live else progress
+        progress = no_progress if source.is_live else progress
         reusing = (
             observer_of_parts(parts, observer)
             if parts
@@ -115,7 +115,8 @@ def run(
         recorder.problems += filter(None, said)
         frames = observed_frames(source, last_observer)
         with recorder, closing(frames), ended_by_signals(source):
-            for done in estimates(with_progress(frames, source, progress), config, source, tracker, smoothed):
+            shown = progress(frames, source.taken_count)
+            for done in estimates(shown, config, source, tracker, smoothed):
                 recorder.add(done)
                 if viewer is not None:
                     pose, lines = done.estimate.calibration.extrinsics, vertex_lines(done.seen.vertices)
@@ -146,13 +147,6 @@ def estimates(
         estimate = filtered if smoothed is None else smoothed.of(filtered, frame.number)
         name = frame_name(frame, source)
         yield Recorded(frame=frame, name=name, seen=seen, estimate=estimate, filtered=filtered)
-
-
-def with_progress(
-    frames: Iterator[tuple[Frame, Observation]], source: FrameSource, progress: Progress | None
-) -> Iterator[tuple[Frame, Observation]]:
-    """Return the frames with their progress, if it is to be shown."""
-    return progress(frames, source.taken_count) if progress else frames
 
 
 def _save_tracker(tracker: RunTracker, camera: Camera, out: OutputFolder) -> dict[str, str]:
@@ -223,11 +217,10 @@ def first_pass(
     tracker: RunTracker,
     observer: Observer,
     out: OutputFolder,
-    progress: Progress | None,
+    progress: Progress,
 ) -> SmoothedPoses:
     """Process the whole drive once, and estimate every pose from all frames."""
     with closing(observed_frames(source, observer)) as frames:
         logger.info("first of two passes")
-        return smooth_frames(
-            with_progress(frames, source, progress), tracker, out, source, joint_config(config)
-        )
+        shown = progress(frames, source.taken_count)
+        return smooth_frames(shown, tracker, out, source, joint_config(config))

@@ -21,7 +21,7 @@ from lanebev.app.fleet.manifest import Drive, read_manifest
 from lanebev.app.fleet.mounts import Stretch, days, drive_mounts, stretches
 from lanebev.app.fleet.page import CameraMounts, fleet_page
 from lanebev.app.fleet.plan import Outcome, Task, drive_folder, earlier_outcome, tasks_of
-from lanebev.app.progress import Progress
+from lanebev.app.progress import Progress, no_progress
 from lanebev.estimation.mount import MountEstimator, MountState
 from lanebev.io.formats.names import check_installed
 from lanebev.io.output.lock import FolderLock
@@ -54,7 +54,7 @@ def fleet(
     root: str | None = None,
     again: bool = False,
     part_minutes: float | None = None,
-    progress: Progress | None = None,
+    progress: Progress = no_progress,
 ) -> FleetResult:
     """Run on the drives of a manifest that are not finished, and collect the results of all.
 
@@ -150,7 +150,7 @@ def write_mounts(path: Path, cameras: Sequence[CameraMounts]) -> None:
 
 
 def _run(
-    tasks: Sequence[Task], cluster: Cluster, again: bool, progress: Progress | None
+    tasks: Sequence[Task], cluster: Cluster, again: bool, progress: Progress
 ) -> tuple[dict[str, Outcome], int]:
     """Run what is not finished; outcomes by name in the order of the tasks, and how many were run."""
     earlier = {task.name: earlier_outcome(task) for task in tasks}
@@ -159,7 +159,7 @@ def _run(
     logger.info("%d drives, %d of them to run", len(tasks), len(to_do))
     if to_do:
         ended: Iterator[Outcome] = outcomes(to_do, cluster)
-        for outcome in progress(ended, len(to_do)) if progress else ended:
+        for outcome in progress(ended, len(to_do)):
             logger.info("%s: %s", outcome.name, outcome.failure or f"{outcome.frames} frames")
             found[outcome.name] = outcome
     return {task.name: _kept(found[task.name], task) for task in tasks}, len(to_do)
