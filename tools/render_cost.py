@@ -19,7 +19,7 @@ from torch.profiler import ProfilerActivity, profile
 
 from lanebev.render import WindowConfig
 from lanebev.render.scene.world import Scene
-from lanebev.render.views import render_scenes, sample_scene
+from lanebev.render.views import render_scenes, sample_views
 from tools.other_device import ELSEWHERE, other_device
 from train.commands import command_parser
 
@@ -30,12 +30,12 @@ WINDOW = WindowConfig(scale=(0.45, 1.05))
 
 def scene_of(count: int, size: tuple[int, int], seed: int = 3) -> Scene:
     """Sample scenes of training."""
-    return sample_scene(count, size, torch.Generator().manual_seed(seed), window=WINDOW)
+    return sample_views(count, size, torch.Generator().manual_seed(seed), window=WINDOW)[0]
 
 
 def sampling_seconds(views: int, threads: int, repeats: int) -> list[float]:
     """Return the seconds of sampling scenes on so many threads, in order."""
-    sample = sample_scene.__wrapped__  # type: ignore[attr-defined]  # which does not set the number of threads
+    sample = sample_views.__wrapped__  # type: ignore[attr-defined]  # which does not set the number of threads
     torch.set_num_threads(threads)
     taken = []
     for seed in range(repeats):

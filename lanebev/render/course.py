@@ -1,4 +1,4 @@
-"""The course of a drive's road: straights and curves joined by clothoids, crests and dips."""
+"""The course of roads, of a drive and of single views: straights, clothoids and curves, crests and dips."""
 
 import math
 
@@ -55,3 +55,35 @@ class Course:
         """Return the road's alignment from ``arc`` on."""
         ahead = arc_nodes()
         return build_alignment(self.curvature(ahead + arc)[None], self.elevation(arc, ahead)[None])
+
+
+def sample_alignment(sampler: BatchSampler) -> Alignment:
+    """Sample the alignment of random roads.
+
+    Half of them straight; the others chains of clothoids, curvature linear between nodes 40 to 120 m apart.
+    A third goes over a crest or through a dip that begins at or beyond the camera.
+    """
+    nodes = 24
+    straight = sampler.chance(0.45)
+    sharp = torch.where(sampler.chance(0.25), 1 / 250, 1 / 900)[:, None]
+    knots = sampler.normal(0.6, nodes).clamp(-1.3, 1.3) * sharp
+    keep = sampler.chance(0.4, nodes)
+    for i in range(1, nodes):
+        knots[:, i] = torch.where(keep[:, i], knots[:, i - 1], knots[:, i])
+    knots = torch.where(straight[:, None], 0.0, knots).double()
+    spacing = sampler.uniform(40, 120, 1).double()
+    shift = sampler.uniform(0, 1, 1).double()
+    arc = arc_nodes()
+    position = (arc / spacing + shift).clamp(max=nodes - 1.001)
+    index = position.long()
+    low, high = knots.gather(1, index), knots.gather(1, index + 1)
+    curvature = low + (high - low) * (position - index)
+
+    bend = torch.where(sampler.chance(0.3), sampler.uniform(-1, 1) / sampler.uniform(1500, 5000), 0.0)[
+        :, None
+    ].double()
+    onset, extent = sampler.uniform(0, 80, 1).double(), sampler.uniform(20, 120, 1).double()
+    inside = (arc - onset).clamp(min=0).minimum(extent)
+    beyond = (arc - onset - extent).clamp(min=0)
+    elevation = bend * (0.5 * inside * inside + extent * beyond)
+    return build_alignment(curvature, elevation)

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from lanebev.geometry.precision import autocast_off
 from lanebev.geometry.vanishing_point import vanishing_point
+from lanebev.render.course import sample_alignment
 from lanebev.render.frame import RenderedFrame
 from lanebev.render.raster.base.features import features_of
 from lanebev.render.raster.paint import paint_view, prepare
@@ -22,9 +23,8 @@ from lanebev.render.scene.camera.lens import (
     varied_intrinsics,
 )
 from lanebev.render.scene.camera.window import WindowConfig, sample_window_scale, window_from_native
-from lanebev.render.scene.road.alignment import build_alignment
 from lanebev.render.scene.sampler import BatchSampler
-from lanebev.render.scene.world import Place, Scene, World, moved_along, sample_course, sample_world, scene_at
+from lanebev.render.scene.world import Place, Scene, World, moved_along, sample_world, scene_at
 from lanebev.render.truth import frame_truth
 from lanebev.tensors import one_thread
 
@@ -127,6 +127,7 @@ def render_views(
     return render_scenes(scene, image_size, seeds, device=device, rows=rows, ideal_sensor=ideal_sensor)
 
 
+@one_thread()
 def sample_views(
     batch_size: int,
     image_size: tuple[int, int],
@@ -142,25 +143,10 @@ def sample_views(
             f"expected batch_size >= 1 and image_size >= (16, 16), got {batch_size} and {tuple(image_size)}"
         )
     generator = _on_cpu(generator)
-    scene = sample_scene(batch_size, image_size, generator, window=window, model=model, kind=kind)
-    return scene, torch.randint(2**62, (batch_size,), generator=generator).tolist()
-
-
-@one_thread()
-def sample_scene(
-    batch_size: int,
-    image_size: tuple[int, int],
-    generator: torch.Generator,
-    *,
-    window: WindowConfig | None = None,
-    model: str = "pinhole",
-    kind: str = "any",
-) -> Scene:
-    """Sample B scenes on the CPU; for the arguments see :func:`render_views`."""
     sampler = BatchSampler(batch_size, generator)
     world, ego_lane = sample_world(sampler, kind)
     world, place = sample_place(sampler, world, ego_lane)
-    alignment = build_alignment(*sample_course(sampler))
+    alignment = sample_alignment(sampler)
     faulty = world.kinds.camera
     intrinsics = sample_intrinsics(sampler, image_size)
     intrinsics = varied_intrinsics(sampler, faulty, intrinsics, image_size)
@@ -169,7 +155,8 @@ def sample_scene(
     lens = Lens(intrinsics, distortion, model, pose)
     if window is not None:
         world, lens = _through_window(sampler, window, image_size, world, lens)
-    return scene_at(world, place, alignment, lens)
+    scene = scene_at(world, place, alignment, lens)
+    return scene, torch.randint(2**62, (batch_size,), generator=generator).tolist()
 
 
 def _through_window(

@@ -11,7 +11,7 @@ from lanebev.render.raster.base.blocks import make_blocks, multiply_rows
 from lanebev.render.rows import send, take_rows
 from lanebev.render.scene.kinds import KINDS
 from lanebev.render.scene.world import Scene
-from lanebev.render.views import render_scenes, sample_scene
+from lanebev.render.views import render_scenes, sample_views
 from lanebev.tensors import all_tensors
 from tools.other_device import ELSEWHERE, Elsewhere, other_device
 
@@ -30,7 +30,7 @@ def generator(seed: int) -> torch.Generator:
 
 
 def scene_of(batch: int, seed: int, kind: str = "any") -> Scene:
-    return sample_scene(batch, SIZE, generator(seed), kind=kind)
+    return sample_views(batch, SIZE, generator(seed), kind=kind)[0]
 
 
 def assert_same(first: RenderedFrame, second: RenderedFrame, share: float = 0.0) -> None:

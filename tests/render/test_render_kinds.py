@@ -7,6 +7,7 @@ import torch
 
 from lanebev.geometry.lens import distort_points
 from lanebev.render import Drive, RenderedFrame, render_views
+from lanebev.render.course import sample_alignment
 from lanebev.render.raster.base.footprint import Ground
 from lanebev.render.raster.base.rays import View
 from lanebev.render.raster.light.night import lamp_light, low_beam
@@ -26,7 +27,7 @@ from lanebev.render.scene.places.street import AHEAD, CROSS, LEFT, NUM_GLYPHS, P
 from lanebev.render.scene.road.alignment import arc_nodes, build_alignment
 from lanebev.render.scene.road.layout import presence
 from lanebev.render.scene.sampler import BatchSampler
-from lanebev.render.scene.world import Place, World, sample_course, sample_world, scene_at
+from lanebev.render.scene.world import Place, World, sample_world, scene_at
 from lanebev.render.views import render_scenes, sample_place
 from lanebev.types import Extrinsics
 
@@ -43,7 +44,7 @@ def seen(kind: str, seed: int, **without: Any) -> RenderedFrame:
     sampler = sampler_of(batch, seed)
     world, ego_lane = sample_world(sampler, kind)
     world, place = sample_place(sampler, world, ego_lane)
-    alignment = build_alignment(*sample_course(sampler))
+    alignment = sample_alignment(sampler)
     intrinsics = sample_intrinsics(sampler, SIZE)
     lens = Lens(
         intrinsics,

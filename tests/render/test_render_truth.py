@@ -5,14 +5,14 @@ import math
 import pytest
 import torch
 
+from lanebev.render.course import sample_alignment
 from lanebev.render.raster.base.features import features_of
 from lanebev.render.raster.base.select import take_channels
 from lanebev.render.raster.paint import paint_view, prepare
 from lanebev.render.scene.camera.lens import Lens, sample_distortion, sample_extrinsics, sample_intrinsics
 from lanebev.render.scene.places.street import no_street
-from lanebev.render.scene.road.alignment import build_alignment
 from lanebev.render.scene.sampler import BatchSampler
-from lanebev.render.scene.world import World, sample_course, sample_world, scene_at
+from lanebev.render.scene.world import World, sample_world, scene_at
 from lanebev.render.truth import boundary_points, project
 from lanebev.render.views import sample_place
 
@@ -87,7 +87,7 @@ def test_points_lie_on_the_centre_of_the_painted_stripe(model: str, seed: int, k
     sampler = BatchSampler(batch, torch.Generator().manual_seed(seed))
     world, ego_lane = bare_world(sampler, kind)
     world, place = sample_place(sampler, world, ego_lane)
-    alignment = build_alignment(*sample_course(sampler))
+    alignment = sample_alignment(sampler)
     intrinsics = sample_intrinsics(sampler, SIZE)
     lens = Lens(
         intrinsics, sample_distortion(sampler, intrinsics, SIZE, model), model, sample_extrinsics(sampler)

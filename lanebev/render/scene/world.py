@@ -44,7 +44,7 @@ from lanebev.render.scene.places.tunnel import (
 )
 from lanebev.render.scene.places.winter import Winter, sample_winter, snowed_layout
 from lanebev.render.scene.places.works import Works, sample_works, works_traffic
-from lanebev.render.scene.road.alignment import Alignment, arc_nodes
+from lanebev.render.scene.road.alignment import Alignment
 from lanebev.render.scene.road.city_layout import sample_city_layout
 from lanebev.render.scene.road.layout import Layout, sample_layout
 from lanebev.render.scene.road.pavement import Pavement, sample_pavement
@@ -252,35 +252,3 @@ def _tinted(surroundings: Surroundings, weather: Weather, lights: Lights) -> Sur
     dim = torch.where((weather.kind == RAIN)[:, None], 0.75, 1.0)
     dim = torch.where((lights.on > 0)[:, None], lights.dark[:, None], dim)
     return surroundings._replace(zenith=zenith * dim, skyline=skyline * dim)
-
-
-def sample_course(sampler: BatchSampler) -> tuple[Tensor, Tensor]:
-    """Sample curvature and elevation of random roads, (B, A) both, at the arc lengths of :func:`arc_nodes`.
-
-    Half of them straight; the others chains of clothoids, curvature linear between nodes 40 to 120 m apart.
-    A third goes over a crest or through a dip that begins at or beyond the camera.
-    """
-    nodes = 24
-    straight = sampler.chance(0.45)
-    sharp = torch.where(sampler.chance(0.25), 1 / 250, 1 / 900)[:, None]
-    knots = sampler.normal(0.6, nodes).clamp(-1.3, 1.3) * sharp
-    keep = sampler.chance(0.4, nodes)
-    for i in range(1, nodes):
-        knots[:, i] = torch.where(keep[:, i], knots[:, i - 1], knots[:, i])
-    knots = torch.where(straight[:, None], 0.0, knots).double()
-    spacing = sampler.uniform(40, 120, 1).double()
-    shift = sampler.uniform(0, 1, 1).double()
-    arc = arc_nodes()
-    position = (arc / spacing + shift).clamp(max=nodes - 1.001)
-    index = position.long()
-    low, high = knots.gather(1, index), knots.gather(1, index + 1)
-    curvature = low + (high - low) * (position - index)
-
-    bend = torch.where(sampler.chance(0.3), sampler.uniform(-1, 1) / sampler.uniform(1500, 5000), 0.0)[
-        :, None
-    ].double()
-    onset, extent = sampler.uniform(0, 80, 1).double(), sampler.uniform(20, 120, 1).double()
-    inside = (arc - onset).clamp(min=0).minimum(extent)
-    beyond = (arc - onset - extent).clamp(min=0)
-    elevation = bend * (0.5 * inside * inside + extent * beyond)
-    return curvature, elevation
