@@ -12,6 +12,7 @@ import torch
 from lanebev.app.config import RunConfig
 from lanebev.app.drive.build import make_observer, make_tracker
 from lanebev.app.drive.sources import camera_of, make_source
+from lanebev.app.drive.upside_down import upside_down_remark
 from lanebev.app.progress import Progress, no_progress
 from lanebev.app.recording.plausibility import pose_remark, pose_words
 from lanebev.camera.model import Camera
@@ -59,12 +60,14 @@ class Sample:
         steps: s between frames, each by the nominal one.
         boundaries: number of boundaries seen, a frame each.
         poses: pitch, yaw, roll (degrees) and height (m) of the frames that were tracked.
+        remark: what else may be wrong with the images; else empty.
     """
 
     undecoded: int = 0
     steps: list[float] = field(default_factory=list)
     boundaries: list[int] = field(default_factory=list)
     poses: list[list[float]] = field(default_factory=list)
+    remark: str = ""
 
 
 def doctor(config: RunConfig, progress: Progress = no_progress) -> tuple[str, int]:
@@ -115,6 +118,7 @@ def sample_frames(config: RunConfig, source: FrameSource, camera: Camera, progre
             if int(pose.status[0]) == Status.TRACKING:
                 values = pose.extrinsics.stack()[0].tolist()
                 sample.poses.append([*map(math.degrees, values[:3]), values[3]])
+    sample.remark = upside_down_remark(observer, tracker, source, len(sample.poses), len(sample.boundaries))
     return sample
 
 
@@ -197,6 +201,8 @@ def check_pose(sample: Sample) -> Finding:
     A wrong focal length changes pitch and yaw, and hardly anything else: lanes alone do not show it, unless
     the pose becomes implausible.
     """
+    if sample.remark:
+        return Finding(DOUBT, sample.remark)
     if not sample.poses:
         return Finding(DOUBT, "pose: none, since lanes were not found well enough in any frame")
     pose = np.median(sample.poses, axis=0).tolist()

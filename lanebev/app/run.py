@@ -34,6 +34,7 @@ from lanebev.app.drive.build import (
 from lanebev.app.drive.observers import Observation, Observer
 from lanebev.app.drive.shared_network import SharedNetwork
 from lanebev.app.drive.sources import camera_of, ended_by_signals, first_image, make_source, observed_frames
+from lanebev.app.drive.upside_down import upside_down_remark
 from lanebev.app.progress import Progress, no_progress
 from lanebev.app.recording.plausibility import bars_remark, mount_remark, unfit_mount_remark
 from lanebev.app.recording.recorder import Recorded, Recorder
@@ -122,7 +123,10 @@ def run(
                     pose, lines = done.estimate.calibration.extrinsics, vertex_lines(done.seen.vertices)
                     viewer.add(RecordedFrame(recorder.rows[-1], pose, lines), done.frame.image)
         recorder.problems += source_remarks(source, files, len(recorder.rows))
-        recorder.problems += filter(None, [unfit_mount_remark(config.mount, recorder.rows)])
+        tracked = sum(row.status == "TRACKING" for row in recorder.rows)
+        upside_down = upside_down_remark(observer, tracker, source, tracked, len(recorder.rows))
+        of_run = (unfit_mount_remark(config.mount, recorder.rows), upside_down)
+        recorder.problems += filter(None, of_run)
         facts = run_facts(config, source, camera) | facts_of(reusing) | _save_tracker(tracker, camera, out)
         logger.info("writing the report")
         report = recorder.finish(facts, Path(source.source).name, truth, tracker.mount)

@@ -1,0 +1,63 @@
+"""Images that are upside down, in which lanes do not determine a pose."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import islice
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from lanebev.app.drive.build import RunTracker
+from lanebev.app.drive.observers import NetworkObserver, Observer
+from lanebev.io.frame_source import FrameSource
+from lanebev.io.frames import Frame
+from lanebev.types import Status
+
+_LOOKED_AT = 8  # frames; fewer tell nothing
+_WITHIN = 120.0  # s of the source, from which these are taken
+_SHARE = 0.5  # fraction of frames in which lanes must determine a pose
+
+
+def upside_down_remark(
+    observer: Observer, tracker: RunTracker, source: FrameSource, tracked: int, count: int
+) -> str:
+    """Return a remark if lanes determine a pose in images turned by 180 degrees, but in few as they are.
+
+    Args:
+        observer: finds lanes; a lane file's tell nothing.
+        tracker: estimates the pose of single images.
+        source: the frames, which are read again, so not of a stream.
+        tracked: number of frames that have a pose ...
+        count: ... of this number.
+    """
+    if (
+        count < _LOOKED_AT
+        or tracked >= _SHARE * count
+        or source.is_live
+        or not isinstance(observer, NetworkObserver)
+    ):
+        return ""
+    most = math.ceil(_WITHIN * float(source.fps / source.selection.every))
+    every = source.selection.every * max(1, min(count, most) // _LOOKED_AT)
+    frames = list(islice(replace(source, selection=source.selection._replace(every=every)), _LOOKED_AT))
+    turned = [frame._replace(image=_turned(frame)) for frame in frames if frame.image is not None]
+    shares = [_share_with_pose(observer, tracker, each) for each in (frames, turned)]
+    if not shares[0] < _SHARE <= shares[1]:
+        return ""
+    return (
+        f"images: {shares[1]:.0%} of some have a pose if they are turned by 180 degrees, {shares[0]:.0%} as "
+        "they are; if they are upside down, turn them, as by ffmpeg -vf hflip,vflip"
+    )
+
+
+def _turned(frame: Frame) -> NDArray[np.uint8] | None:
+    return None if frame.image is None else np.ascontiguousarray(frame.image[::-1, ::-1])
+
+
+def _share_with_pose(observer: Observer, tracker: RunTracker, frames: Sequence[Frame]) -> float:
+    """Return the share of frames whose lanes determine a pose; 0 of none."""
+    with torch.inference_mode():
+        poses = [tracker.still(observer(frame).vertices, 1.0).calibration for frame in frames]
+    return float(np.mean([int(pose.status[0]) == Status.TRACKING for pose in poses])) if poses else 0.0
