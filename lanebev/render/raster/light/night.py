@@ -36,8 +36,17 @@ class Sprites(NamedTuple):
     glare: Tensor
 
 
+def headlight_irradiance(x: Tensor, z: Tensor) -> Tensor:
+    """Compute the relative irradiance of usual dipped headlights on the road at (x, z) m, (B, N)."""
+    distance = z.clamp(min=0.5)
+    spread = torch.exp(-(((x - 0.02 * distance) / (1.8 + 0.22 * distance)) ** 2))
+    pools = 1 + 0.5 * torch.exp(-(((x.abs() - 0.9 - 0.05 * distance) / (0.7 + 0.05 * distance)) ** 2))
+    reach = (1 - torch.exp(-((distance / 5.0) ** 2))) / (1 + (distance / 14.0) ** 2)
+    return 1.2 * spread * pools * reach
+
+
 def low_beam(lights: Lights, x: Tensor, z: Tensor) -> Tensor:
-    """Compute the relative irradiance of the own dipped headlights on the road at (x, z) m, (B, N)."""
+    """Compute the relative irradiance of each night's own dipped headlights at (x, z) m, (B, N)."""
     ahead = z.clamp(min=0.5)
     wide = lights.beam_width[:, :1] + lights.beam_width[:, 1:] * ahead
     aside = (x - 0.03 * ahead) / wide

@@ -13,9 +13,9 @@ from lanebev.render.raster.base.features import Features
 from lanebev.render.raster.base.rays import View
 from lanebev.render.raster.base.select import as_float, choose, put, take, take_channels
 from lanebev.render.raster.base.tiles import tile_corners, tile_pixels
+from lanebev.render.raster.light.night import headlight_irradiance
 from lanebev.render.raster.objects.houses import lit_windows
 from lanebev.render.raster.objects.wall_texture import wall_texture
-from lanebev.render.raster.road.ground import headlight_irradiance
 from lanebev.render.rows import take_rows
 from lanebev.render.scene.objects.surroundings import FENCE, HEDGE, HOUSES, NUM_WALLS, TREES, Wall, walls_of
 from lanebev.render.scene.road.alignment import elevation_at, wall_hit, wall_table

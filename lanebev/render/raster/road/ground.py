@@ -11,7 +11,7 @@ from lanebev.render.raster.base.features import Features, KindRows
 from lanebev.render.raster.base.footprint import Ground
 from lanebev.render.raster.base.noise import blotches, smoothstep
 from lanebev.render.raster.base.select import lines_of, put, take, take_channels
-from lanebev.render.raster.light.night import night_irradiance
+from lanebev.render.raster.light.night import headlight_irradiance, night_irradiance
 from lanebev.render.raster.light.shadows import shadows
 from lanebev.render.raster.road.markings import near_marking, paint
 from lanebev.render.raster.road.roadside import add_roadside
@@ -37,15 +37,6 @@ class Surface(NamedTuple):
 
     albedo: Tensor
     coverage: Tensor
-
-
-def headlight_irradiance(x: Tensor, z: Tensor) -> Tensor:
-    """Compute the relative irradiance of dipped headlights on the road at (x, z) m, (B, N)."""
-    distance = z.clamp(min=0.5)
-    spread = torch.exp(-(((x - 0.02 * distance) / (1.8 + 0.22 * distance)) ** 2))
-    pools = 1 + 0.5 * torch.exp(-(((x.abs() - 0.9 - 0.05 * distance) / (0.7 + 0.05 * distance)) ** 2))
-    reach = (1 - torch.exp(-((distance / 5.0) ** 2))) / (1 + (distance / 14.0) ** 2)
-    return 1.2 * spread * pools * reach
 
 
 def ground_radiance(
