@@ -1,12 +1,17 @@
 """Short drives and how a calibrator follows them, for several test files."""
 
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from lanebev.estimation.joint.calibrator import JointCalibrator
+from lanebev.estimation.joint.config import JointConfig
+from lanebev.estimation.joint.filter.restart import scatter_of_fit
+from lanebev.estimation.joint.frame.single_frame import fit_observations
 from lanebev.estimation.joint.layout import layout
+from lanebev.estimation.joint.measurement.observations import boundary_places, observe
 from lanebev.observation.segments import LaneSegments
 from lanebev.testing.moments import CAMERA, FPS, WIDTH, Moment, moments
 from lanebev.testing.moments import observe as see
@@ -69,6 +74,18 @@ def follow(
         calibration, state = calibrator(segments, cameras(rows), state, moment.dt, WIDTH)
         followed.append(Followed(moment, segments, calibration, state))
     return followed
+
+
+def fitted_frame(**change):
+    """Fit one frame without noise, changed so, by itself: its pose (1, 4) and scatter."""
+    [moment] = moments(1 / FPS, lambda t, moment: replace(moment, **change))
+    _, segments = next(see([moment], 1, 0.0, 20, 0, DOUBLE))
+    segments = segments._replace(sigma=torch.ones_like(segments.sigma))
+    seen = observe(segments, CAMERA[None], 6)
+    own = boundary_places(WIDTH, 6, seen.sigma).expand(1, -1).gather(1, seen.boundary)
+    config = JointConfig()
+    fit = fit_observations(seen, own, config.prior)
+    return fit.extrinsics.stack(), scatter_of_fit(fit, own, seen, config)
 
 
 def nothing(segments: LaneSegments) -> LaneSegments:

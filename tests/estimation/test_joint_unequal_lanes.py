@@ -9,12 +9,9 @@ import torch
 from lanebev.estimation.joint.calibrator import JointCalibrator
 from lanebev.estimation.joint.config import JointConfig
 from lanebev.estimation.joint.filter.evidence import CALL, deviation_prior_std
-from lanebev.estimation.joint.filter.restart import scatter_of_fit
 from lanebev.estimation.joint.filter.scatter import remembered_sensitivity, summed_places
-from lanebev.estimation.joint.frame.single_frame import fit_observations
-from lanebev.estimation.joint.frame_prior import FramePrior
 from lanebev.estimation.joint.layout import NUM_POSE
-from lanebev.estimation.joint.measurement.observations import boundary_places, observe
+from lanebev.estimation.joint.measurement.observations import boundary_places
 from lanebev.estimation.joint.measurement.residuals import HEIGHT, NUM_SHAPE, OFFSET, ROLL
 from lanebev.estimation.joint.output import (
     as_calibration,
@@ -24,9 +21,9 @@ from lanebev.estimation.joint.output import (
     unverified_deviation,
 )
 from lanebev.estimation.reasons import Reason
-from lanebev.testing.moments import CAMERA, PLACES, WIDTH, moments
+from lanebev.testing.moments import PLACES, WIDTH, moments
 from lanebev.testing.moments import observe as see
-from tests.estimation.joint_drives import DOUBLE, drive, follow, nothing, run
+from tests.estimation.joint_drives import DOUBLE, drive, fitted_frame, follow, nothing, run
 
 torch.set_num_threads(1)
 
@@ -237,18 +234,9 @@ def test_the_sensitivity_of_a_start_is_that_of_its_fit():
     """Put a boundary out of place by 1 mm: the fit changes by as much as its sensitivity says."""
     moved = PLACES.clone()
     moved[3] += 0.001
-
-    def fitted(places):
-        drive = moments(1 / 30, lambda t, m: replace(m, places=places))
-        _, segments = next(iter(see(drive, 1, 0.0, 20, 0, DOUBLE)))
-        segments = segments._replace(sigma=torch.ones_like(segments.sigma))
-        seen = observe(segments, CAMERA[None], 6)
-        own = boundary_places(WIDTH, 6, seen.sigma).expand(1, -1).gather(1, seen.boundary)
-        fit = fit_observations(seen, own, FramePrior())
-        return fit.extrinsics.stack(), scatter_of_fit(fit, own, seen, JointConfig()).sensitivity
-
-    (before, sensitivity), (after, _) = fitted(PLACES), fitted(moved)
-    torch.testing.assert_close((after - before)[0], 0.001 * sensitivity[0, :, 3], rtol=0.05, atol=2e-6)
+    (before, scatter), (after, _) = (fitted_frame(places=places) for places in (PLACES, moved))
+    expected = 0.001 * scatter.sensitivity[0, :, 3]
+    torch.testing.assert_close((after - before)[0], expected, rtol=0.05, atol=2e-6)
 
 
 def test_height_doubts_roll_that_is_held_as_the_lane_seen_bends_it():

@@ -10,7 +10,6 @@ import torch
 from lanebev import JointCalibrator, LaneSegments
 from lanebev.estimation.joint.config import JointConfig
 from lanebev.estimation.joint.filter.lane_change import shifted
-from lanebev.estimation.joint.filter.restart import scatter_of_fit
 from lanebev.estimation.joint.filter.scatter import (
     averaged_moments,
     boundary_scatter,
@@ -21,7 +20,6 @@ from lanebev.estimation.joint.filter.scatter import (
     with_headings,
 )
 from lanebev.estimation.joint.filter.update import information, membership
-from lanebev.estimation.joint.frame.single_frame import fit_observations
 from lanebev.estimation.joint.measurement.observations import boundary_places, observe
 from lanebev.estimation.joint.measurement.residuals import NUM_STRAIGHT, PITCH, ROLL, boundary_residuals
 from lanebev.estimation.joint.output import (
@@ -35,23 +33,12 @@ from lanebev.testing.moments import CAMERA, PLACES, WIDTH, moments
 from lanebev.testing.moments import observe as see
 from lanebev.testing.segments import stack_rows
 from lanebev.testing.streets import wandering
-from tests.estimation.joint_drives import follow
+from tests.estimation.joint_drives import fitted_frame, follow
 
 DOUBLE = torch.float64
 ONE_FRAME = 1 / 30
 CONFIG = JointConfig()
 CALIBRATOR = JointCalibrator()
-
-
-def scatter_of_frame(places, headings, sigma=1.0, seed=0):
-    """Fit the frame of one moment by itself and return its scatter."""
-    [moment] = moments(ONE_FRAME, lambda t, m: replace(m, places=places, headings=headings, far=40.0))
-    _, segments = next(iter(see([moment], 1, sigma, 20, seed, DOUBLE)))
-    segments = segments._replace(sigma=torch.ones_like(segments.sigma))
-    seen = observe(segments, CAMERA[None], 6)
-    own = boundary_places(WIDTH, 6, seen.sigma).expand(1, -1).gather(1, seen.boundary)
-    fit = fit_observations(seen, own, CONFIG.prior)
-    return fit.extrinsics.stack(), scatter_of_fit(fit, own, seen, CONFIG)
 
 
 @pytest.mark.parametrize(("place_std", "heading_std"), [(0.04, 0.003), (0.06, 0.003), (0.02, 0.006)])
@@ -96,8 +83,8 @@ def test_parallel_boundaries_add_almost_nothing(visible):
 def test_the_sensitivity_to_a_heading_is_the_change_of_the_fit():
     headings = torch.zeros(6, dtype=DOUBLE)
     headings[3] = 1e-4
-    before, scatter = scatter_of_frame(PLACES, 0 * headings, 0.0)
-    after, _ = scatter_of_frame(PLACES, headings, 0.0)
+    before, scatter = fitted_frame(headings=0 * headings, far=40.0)
+    after, _ = fitted_frame(headings=headings, far=40.0)
     expected = 1e-4 * scatter.sensitivity[0, :, 6 + 3]
     torch.testing.assert_close((after - before)[0], expected, rtol=0.1, atol=2e-6)
     assert expected[PITCH].abs() > 5e-6

@@ -138,15 +138,21 @@ def test_gradient_of_the_pose_lowers_its_error(batch):
     assert losses[-1] < 0.9 * losses[0]
 
 
+def faint_logits(share):
+    """Strengths (L, 1, 1) of the boundaries' maps, all 1, and the logits of maps (B, L, h, w) times these."""
+    faint = torch.ones(6, 1, 1, dtype=torch.float64, requires_grad=True)
+    maps = torch.cat([1 - (faint * share).sum(1, keepdim=True), faint * share], dim=1)
+    return faint, maps.clamp(min=1e-6).log()
+
+
 def test_fainter_lines_are_no_way_to_a_better_pose(batch):
     """A map as a whole made fainter lies where it lay: with ``detach_confidence`` that has no gradient."""
     unit = torch.tensor([0.005, 0.005, 0.01, 0.05], dtype=torch.float64)
     share = (unpack(batch)[1][:, 1:].double() * 0.5).roll(1, dims=-1)
     slopes = []
     for detach_confidence in (False, True):
-        faint = torch.ones(6, 1, 1, dtype=torch.float64, requires_grad=True)
-        maps = torch.cat([1 - (faint * share).sum(1, keepdim=True), faint * share], dim=1)
-        found = fit(maps.clamp(min=1e-6).log(), batch, detach_confidence=detach_confidence)
+        faint, logits = faint_logits(share)
+        found = fit(logits, batch, detach_confidence=detach_confidence)
         (slope,) = torch.autograd.grad(pose_loss(found, batch.extrinsics.double(), unit), faint)
         slopes.append(slope.norm())
     assert slopes[1] < 0.1 * slopes[0]
@@ -170,10 +176,8 @@ def test_likelihood_is_largest_where_sigmas_are_the_errors(batch):
 def test_likelihood_asks_for_what_can_be_seen(batch):
     """Faint maps where the truth is: stronger ones lower the loss, which errors alone don't ask for."""
     floor = torch.tensor([0.0005, 0.0015, 0.002, 0.005], dtype=torch.float64)
-    share = unpack(batch)[1][:, 1:].double() * 0.6
-    faint = torch.ones(6, 1, 1, dtype=torch.float64, requires_grad=True)
-    maps = torch.cat([1 - (faint * share).sum(1, keepdim=True), faint * share], dim=1)
-    found = fit(maps.clamp(min=1e-6).log(), batch)
+    faint, logits = faint_logits(unpack(batch)[1][:, 1:].double() * 0.6)
+    found = fit(logits, batch)
     (slope,) = torch.autograd.grad(student_t_nll(found, batch.extrinsics.double(), floor), faint)
     assert slope.isfinite().all()
     assert slope.sum() < 0
