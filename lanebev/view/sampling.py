@@ -3,14 +3,15 @@
 Coordinates are computed in blocks of rows that stay in the cache; without gradients, in memory that is kept.
 """
 
-import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import cv2
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from lanebev.tensors import one_thread
 from lanebev.view.blocks import Block, blocks, traced
 from lanebev.view.lens import Lens
 from lanebev.view.projection import Cells
@@ -19,7 +20,8 @@ from lanebev.view.reused_memory import ReusedArrays
 _kept = ReusedArrays()
 
 _PUSH = 4.0  # half widths of a map by which what lies outside is moved away from it
-_FEW_CHANNELS = 8  # channels of which a copy costs less than to sample one image with one thread
+_MOST_SIDE = (1 << 15) - 1  # of images that OpenCV samples, px, is less
+_OPENCV_IS_EXACT = int(cv2.__version__.split(".")[0]) >= 5  # before, it rounds coordinates to 1/32 px
 
 
 class MapSize(NamedTuple):
@@ -55,8 +57,8 @@ def resampled(
         (B, C, R, V) of each map in its dtype, and (B, 1, R, V) bool: valid.
     """
     at = sampling_maps(cells, lens, sizes, image_size)
-    sampled = [_sample(each, where) for each, where in zip(maps, at, strict=True)]
-    return sampled, _at_most_one(at[0][:, :1])
+    valid = _at_most_one(at[0][:, :1])
+    return [_sample(each, where) for each, where in zip(maps, at, strict=True)], valid
 
 
 def _at_most_one(values: Tensor) -> Tensor:
@@ -166,27 +168,32 @@ def map_coordinate(
 
 
 def _sample(features: Tensor, at: Tensor) -> Tensor:
-    """Sample (B, C, h, w) bilinearly at (B, 2, R, V), zero where that lies outside, in its dtype."""
-    strips = _strips(features, at)
-    if strips == 1:
-        return _grid_sample(features, at)
-    parts = at[0].unflatten(1, (strips, -1)).transpose(0, 1)
-    sampled = _grid_sample(features.expand(strips, -1, -1, -1), parts)
-    return sampled.transpose(0, 1).flatten(1, 2).unsqueeze(0)
+    """Sample (B, C, h, w) bilinearly at (B, 2, R, V), zero where that lies outside, in its dtype.
 
-
-def _strips(features: Tensor, at: Tensor) -> int:
-    """Return the number of strips of rows to be sampled as if they were images of a batch.
-
-    ``grid_sample`` divides its work on a CPU by images: of one image, one thread does all. A copy puts the
-    strips together, and gradients of the image would be computed once for each.
+    OpenCV divides one image among threads, which ``grid_sample`` does not, and samples many channels in half
+    the time. It overwrites the coordinates.
     """
-    one = features.shape[0] == 1 and features.shape[1] <= _FEW_CHANNELS and features.device.type == "cpu"
-    return math.gcd(at.shape[2], torch.get_num_threads()) if one and _may_overwrite() else 1
+    by_opencv = (
+        _may_overwrite()
+        and (at.device.type, at.dtype) == ("cpu", torch.float32)
+        and _OPENCV_IS_EXACT
+        and max(*features.shape[2:], *at.shape[2:]) < _MOST_SIDE
+    )
+    return (_remapped if by_opencv else _grid_sample)(features.to(at.dtype), at).to(features.dtype)
+
+
+@one_thread()  # of PyTorch; OpenCV uses its own
+def _remapped(features: Tensor, at: Tensor) -> Tensor:
+    for plane, side in zip(at.unbind(1), reversed(features.shape[2:]), strict=True):
+        # to pixels, rounded as by grid_sample
+        torch.add(plane.new_tensor(-0.5), plane.add_(1), alpha=side / 2, out=plane)
+    sampled = at.new_empty(*features.shape[:2], *at.shape[2:])
+    images = features.detach().contiguous().numpy()
+    for image, (x, y), bev in zip(images, at.numpy(), sampled.numpy(), strict=True):
+        for channel, out in zip(image, bev, strict=True):
+            cv2.remap(channel, x, y, cv2.INTER_LINEAR, out)
+    return sampled
 
 
 def _grid_sample(features: Tensor, at: Tensor) -> Tensor:
-    sampled = F.grid_sample(
-        features.to(at.dtype), at.movedim(1, -1), "bilinear", "zeros", align_corners=False
-    )
-    return sampled.to(features.dtype)
+    return F.grid_sample(features, at.movedim(1, -1), "bilinear", "zeros", align_corners=False)

@@ -40,6 +40,39 @@ def test_the_view_is_the_same_with_and_without_a_graph(lens, stride):
         assert torch.allclose(bev, expected, atol=1e-6, rtol=0)
 
 
+@pytest.mark.parametrize(
+    "kind", ["channels last", "mirrored", "of half precision", "with a graph", "of no channel"]
+)
+def test_images_in_any_order_of_memory_and_type_are_sampled_without_a_graph(kind):
+    images = torch.rand(2, 3, 90, 160, generator=torch.Generator().manual_seed(0))
+    images = {
+        "channels last": images.contiguous(memory_format=torch.channels_last),
+        "mirrored": torch.rand(2, 3, 160, 90, generator=torch.Generator().manual_seed(0)).mT,
+        "of half precision": images.half(),
+        "with a graph": images.requires_grad_(),
+        "of no channel": images[:, :0],
+    }[kind]
+    before = images.detach().clone()
+    expected, seen = warped("pinhole", images)
+    with torch.no_grad():
+        bev, valid = warped("pinhole", images)
+    assert bev.dtype == images.dtype
+    assert torch.equal(valid, seen)
+    assert torch.allclose(bev, expected, atol=1e-3 if bev.dtype == torch.half else 1e-6, rtol=0)
+    assert torch.equal(images, before)
+
+
+def test_views_of_more_rows_than_opencv_samples_are_the_same_without_a_graph():
+    grid = BEVGrid(x=(-0.001, 0.001), z=(3.0, 36.0), resolution=0.001)
+    images = torch.rand(1, 1, 180, 320, generator=torch.Generator().manual_seed(0))
+    poses = Extrinsics(*(value[:1] for value in POSES))
+    expected, _ = BEVWarp(grid)(images, INTRINSICS[None], poses)
+    with torch.no_grad():
+        bev, _ = BEVWarp(grid)(images, INTRINSICS[None], poses)
+    assert bev.shape[2] == 33_000
+    assert torch.allclose(bev, expected, atol=1e-6, rtol=0)
+
+
 def test_a_view_stays_as_it_is_when_the_next_is_made():
     first, second = torch.rand(2, 2, 3, 180, 320, generator=torch.Generator().manual_seed(1))
     with torch.no_grad():
