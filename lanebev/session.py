@@ -24,6 +24,7 @@ from lanebev.estimation.tracker import Tracker
 from lanebev.io.frame_clock import FrameClock
 from lanebev.io.lanes.doubts import LaneDoubts
 from lanebev.io.lanes.parsing import FrameLines
+from lanebev.io.speeds import fast_remark
 from lanebev.io.state import lane_width_remark, load_state, save_state
 from lanebev.numbers import check_number
 from lanebev.observation.boundary_vertices import BoundaryVertices
@@ -171,6 +172,7 @@ class Session:
                 raise ValueError(f"speed: expected finite m/s, or None if it is not known, got {speed}")
         pixels = None if frame is None else self._rgb(frame)
         dt, remarks = self._clock.step(stamp)
+        fast = fast_remark(speed or 0.0, "divide it by 3.6")
         lost = ["no frame was given"] if frame is None and polylines is None else []
         with torch.inference_mode():
             vertices, scale = self._vertices(pixels, polylines)
@@ -192,6 +194,7 @@ class Session:
             status=Status(int(calibration.status[0])),
             reasons=remarks
             + lost
+            + ([fast] if fast else [])
             + ([self._lanes.doubt] if self._lanes.doubt else [])
             + describe_reasons(reasons & ~Reason.TIME if remarks else reasons),
             mount=mounted,

@@ -69,7 +69,18 @@ class CommandLine(LightningCLI):
         config.ckpt_path = str(found[-1])
 
     def before_fit(self) -> None:
-        """Warn of bfloat16 on a CPU that only emulates it, which takes ten times as long as float32."""
+        """Raise if training would never end; warn of bfloat16 on a CPU that only emulates it.
+
+        That takes ten times as long as float32.
+        """
+        limits = self.config[str(self.subcommand)].trainer
+        counted = isinstance(limits.limit_train_batches, int) or limits.fast_dev_run
+        has_end = counted or limits.max_time is not None
+        if not has_end and limits.max_steps == -1 and limits.max_epochs not in (-1, 0):  # -1: without end
+            raise ValueError(
+                "max_steps: expected the number of steps, since random views never end an epoch, got -1; "
+                "give it, or with max_epochs the steps of an epoch, --trainer.limit_train_batches"
+            )
         on_cpu = isinstance(self.trainer.accelerator, CPUAccelerator)
         half = on_cpu and self.trainer.precision.startswith("bf16")
         if half and not torch.ops.mkldnn._is_mkldnn_bf16_supported():

@@ -83,6 +83,11 @@ _OF_NO_MODEL = (
     "it states four coefficients and no lens model; they are taken as k1 k2 p1 p2 of a pinhole camera: "
     "if it is a fisheye, add model: fisheye"
 )
+_RENAME = "rename it, or leave it out"
+_INSTEAD = {  # of keys in lower case
+    "fov": "give the horizontal field of view by --fov DEGREES or Camera.from_fov, in place of the file",
+    "focal|sensor": "fx is the focal length over the sensor's width, in mm, times the images' width in px",
+}
 _OFF_CENTRE = 0.1  # shares of the sides, more than which a file without a size is of other images
 _IDENTITY = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]
 
@@ -120,9 +125,10 @@ def opencv_or_ros(
     elif not {*MATRIX_KEYS, *_PROJECTION_KEYS}.isdisjoint(fields):
         unknown = [*filter(_OF_CAMERA.match, unknown)]
     if unknown:
+        remedy = next((words for form, words in _INSTEAD.items() if re.search(form, unknown[0])), _RENAME)
         raise ValueError(
             f"unknown key {shown(unknown[0])}; expected fx, fy, cx, cy, width, height, distortion, model, or "
-            "camera_matrix and distortion_coefficients; rename it, or leave it out"
+            f"camera_matrix and distortion_coefficients; {remedy}"
         )
     if image_size and not any(fields.get(key) is not None for key in (*_WIDTH_KEYS, *_HEIGHT_KEYS)):
         return _of_images(fields, rectified, image_size)

@@ -14,6 +14,7 @@ from lanebev.numbers import read_text
 
 _NEAREST = 1.0  # s between a frame and the nearest speed, at most
 _FASTEST = 100.0  # m/s
+_FAST = 45.0  # m/s; more may be km/h
 _SPEED = ("speed", "velocity", "vel", "v", "vf")  # words of a column's title
 _TIME = ("time", "timestamp", "stamp", "t")
 _SPEED_UNITS = {
@@ -78,6 +79,13 @@ class Speeds(NamedTuple):
         after = np.searchsorted(self.times, times).clip(1, max(len(self.times) - 1, 1))
         around = self.times[np.stack([after - 1, after]).clip(0, len(self.times) - 1)]
         return int((np.abs(around - times).min(0) > _NEAREST).sum())
+
+
+def fast_remark(speed: float, remedy: str) -> str:
+    """Return a remark on a speed (m/s) that may be in km/h, with what to do then; else nothing."""
+    if abs(speed) <= _FAST:
+        return ""
+    return f"speed: up to {abs(speed):.3g} m/s, {abs(3.6 * speed):.0f} km/h; if it is in km/h, {remedy}"
 
 
 def read_speeds(path: str | Path) -> Speeds:

@@ -314,6 +314,12 @@ def test_a_speed_is_a_finite_number():
         session(stamp=0.0, speed=math.nan)
 
 
+def test_a_speed_in_kilometres_an_hour_is_noticed():
+    said = [Session(CAMERA)(stamp=0.0, speed=speed).reasons for speed in (33.0, 120.0, -120.0)]
+    remark = "speed: up to 120 m/s, 432 km/h; if it is in km/h, divide it by 3.6"
+    assert [remark in reasons for reasons in said] == [False, True, True]
+
+
 def test_a_given_speed_is_that_of_the_road_that_passes():
     sessions = Session(CAMERA), Session(CAMERA)
     for number in range(3):

@@ -53,6 +53,26 @@ def test_every_config_trains_a_step(config, tmp_path):
     assert any(row["val/recall"] for row in rows)
 
 
+@pytest.mark.parametrize("more", [["--trainer.max_epochs=1"], []])
+def test_epochs_of_random_views_have_no_end(tmp_path, capsys, more):
+    with pytest.raises(SystemExit) as stopped:
+        run("fit", "fast.yaml", tmp_path, "--trainer.max_steps=-1", *more)
+    assert stopped.value.code == 2
+    said = "error: max_steps: expected the number of steps, since random views never end an epoch, got -1"
+    assert said in capsys.readouterr().err
+
+
+def test_epochs_of_some_batches_end(tmp_path):
+    run(
+        "fit",
+        "fast.yaml",
+        tmp_path,
+        "--trainer.max_steps=-1",
+        "--trainer.max_epochs=1",
+        "--trainer.limit_train_batches=1",
+    )
+
+
 @pytest.mark.slow
 def test_training_goes_on_from_a_weights_file_and_exports_it_unchanged(tmp_path):
     torch.manual_seed(0)

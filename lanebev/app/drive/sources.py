@@ -25,12 +25,11 @@ from lanebev.io.images.names import drives_remark, jump_remark, untimed_remark
 from lanebev.io.live import LiveSource, open_live
 from lanebev.io.opening import open_source
 from lanebev.io.source_names import is_bag, is_live, without_login
-from lanebev.io.speeds import Speeds, read_speeds
+from lanebev.io.speeds import Speeds, fast_remark, read_speeds
 from lanebev.report.run_folder import RunFolder
 from lanebev.signals import handlers_kept
 
 _RECTIFIED = re.compile(r"(?:^|[/_])rect(?:ified)?(?:[/_]|$)")  # in topics of ROS's image_proc, which P is of
-_FAST = 45.0  # m/s; more may be km/h
 _MOST_WITHOUT = 0.5  # fraction of the frames, that may be without speed
 _LONG_STEP = 5  # s between frames, in which a pose has nothing to do with the one before
 
@@ -133,10 +132,8 @@ def _speeds_remark(speeds: Speeds | None, source: FrameSource) -> str:
     if speeds is None:
         return ""
     fastest = np.nanmax(np.abs(speeds.speeds), initial=0.0)
-    if fastest > _FAST:
-        return (
-            f"speed: up to {fastest:.3g} m/s, {3.6 * fastest:.0f} km/h; if it is in km/h, title it speed_kmh"
-        )
+    if remark := fast_remark(float(fastest), "title it speed_kmh"):
+        return remark
     times = np.array(source.times or [float(number / source.fps) for number in range(source.count)])
     without = speeds.without(times)
     if without <= _MOST_WITHOUT * len(times):
