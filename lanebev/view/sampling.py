@@ -170,8 +170,8 @@ def map_coordinate(
 def _sample(features: Tensor, at: Tensor) -> Tensor:
     """Sample (B, C, h, w) bilinearly at (B, 2, R, V), zero where that lies outside, in its dtype.
 
-    OpenCV divides one image among threads, which ``grid_sample`` does not, and samples many channels in half
-    the time. It overwrites the coordinates.
+    OpenCV divides one image among threads, which ``grid_sample`` does not, and waits for none that is late.
+    The coordinates are overwritten then.
     """
     by_opencv = (
         _may_overwrite()
