@@ -41,7 +41,10 @@ def upside_down_remark(
         return ""
     most = math.ceil(_WITHIN * float(source.fps / source.selection.every))
     every = source.selection.every * max(1, min(count, most) // _LOOKED_AT)
-    frames = list(islice(replace(source, selection=source.selection._replace(every=every)), _LOOKED_AT))
+    try:
+        frames = list(islice(replace(source, selection=source.selection._replace(every=every)), _LOOKED_AT))
+    except (OSError, ValueError):  # deleted or changed during the run, which is noticed elsewhere
+        return ""
     turned = [frame._replace(image=_turned(frame)) for frame in frames if frame.image is not None]
     shares = [_share_with_pose(observer, tracker, each) for each in (frames, turned)]
     if not shares[0] < _SHARE <= shares[1]:

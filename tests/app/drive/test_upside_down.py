@@ -1,5 +1,6 @@
 """Images that are upside down: lanes determine no pose, and the run says why."""
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -54,4 +55,15 @@ def test_lanes_that_are_seen_in_turned_images_only_are_said(source):
 def test_upright_images_without_lanes_are_not_turned(source, tmp_path):
     for number in range(10):
         Image.new("RGB", (WIDTH, HEIGHT)).save(tmp_path / f"{number}.png")
+    assert upside_down_remark(NetworkObserver(Bright(), CAMERA), TRACKER, source, 0, 10) == ""
+
+
+def test_a_video_that_is_deleted_during_the_run_is_not_read_again(tmp_path):
+    path = tmp_path / "drive.avi"
+    video = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10.0, (WIDTH, HEIGHT))
+    for _ in range(10):
+        video.write(np.zeros((HEIGHT, WIDTH, 3), np.uint8))
+    video.release()
+    source = open_source(str(path))
+    path.unlink()
     assert upside_down_remark(NetworkObserver(Bright(), CAMERA), TRACKER, source, 0, 10) == ""
