@@ -171,15 +171,17 @@ def _sample(features: Tensor, at: Tensor) -> Tensor:
     """Sample (B, C, h, w) bilinearly at (B, 2, R, V), zero where that lies outside, in its dtype.
 
     OpenCV divides one image among threads, which ``grid_sample`` does not, and waits for none that is late.
-    The coordinates are overwritten then.
+    The coordinates are overwritten then. Between two infinite values its result is NaN.
     """
+    dtype, features = features.dtype, features.to(at.dtype)
     by_opencv = (
         _may_overwrite()
         and (at.device.type, at.dtype) == ("cpu", torch.float32)
         and _OPENCV_IS_EXACT
         and max(*features.shape[2:], *at.shape[2:]) < _MOST_SIDE
+        and bool(features.sum().isfinite())
     )
-    return (_remapped if by_opencv else _grid_sample)(features.to(at.dtype), at).to(features.dtype)
+    return (_remapped if by_opencv else _grid_sample)(features, at).to(dtype)
 
 
 @one_thread()  # of PyTorch; OpenCV uses its own
@@ -188,7 +190,7 @@ def _remapped(features: Tensor, at: Tensor) -> Tensor:
         # to pixels, rounded as by grid_sample
         torch.add(plane.new_tensor(-0.5), plane.add_(1), alpha=side / 2, out=plane)
     sampled = at.new_empty(*features.shape[:2], *at.shape[2:])
-    images = features.detach().contiguous().numpy()
+    images = features.contiguous().numpy(force=True)
     for image, (x, y), bev in zip(images, at.numpy(), sampled.numpy(), strict=True):
         for channel, out in zip(image, bev, strict=True):
             cv2.remap(channel, x, y, cv2.INTER_LINEAR, out)

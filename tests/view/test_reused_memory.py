@@ -41,7 +41,16 @@ def test_the_view_is_the_same_with_and_without_a_graph(lens, stride):
 
 
 @pytest.mark.parametrize(
-    "kind", ["channels last", "mirrored", "of half precision", "with a graph", "of no channel"]
+    "kind",
+    [
+        "channels last",
+        "mirrored",
+        "of half precision",
+        "with a graph",
+        "of no channel",
+        "of infinite values",
+        "negated without a copy",
+    ],
 )
 def test_images_in_any_order_of_memory_and_type_are_sampled_without_a_graph(kind):
     images = torch.rand(2, 3, 90, 160, generator=torch.Generator().manual_seed(0))
@@ -49,8 +58,10 @@ def test_images_in_any_order_of_memory_and_type_are_sampled_without_a_graph(kind
         "channels last": images.contiguous(memory_format=torch.channels_last),
         "mirrored": torch.rand(2, 3, 160, 90, generator=torch.Generator().manual_seed(0)).mT,
         "of half precision": images.half(),
-        "with a graph": images.requires_grad_(),
+        "with a graph": images.clone().requires_grad_(),
         "of no channel": images[:, :0],
+        "of infinite values": images.masked_fill(images > 0.5, -torch.inf),  # as of log-probabilities
+        "negated without a copy": torch.complex(images, images).conj().imag,
     }[kind]
     before = images.detach().clone()
     expected, seen = warped("pinhole", images)
