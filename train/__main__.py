@@ -74,7 +74,7 @@ class CommandLine(LightningCLI):
         That takes ten times as long as float32.
         """
         limits = self.config[str(self.subcommand)].trainer
-        counted = isinstance(limits.limit_train_batches, int) or limits.fast_dev_run
+        counted = isinstance(limits.limit_train_batches, int) or limits.overfit_batches or limits.fast_dev_run
         has_end = counted or limits.max_time is not None
         if not has_end and limits.max_steps == -1 and limits.max_epochs not in (-1, 0):  # -1: without end
             raise ValueError(

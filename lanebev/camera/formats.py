@@ -84,7 +84,7 @@ _OF_NO_MODEL = (
     "if it is a fisheye, add model: fisheye"
 )
 _RENAME = "rename it, or leave it out"
-_INSTEAD = {  # of keys in lower case
+_INSTEAD = {  # of keys in lower case, in place of a focal length in px
     "fov": "give the horizontal field of view by --fov DEGREES or Camera.from_fov, in place of the file",
     "focal|sensor": "fx is the focal length over the sensor's width, in mm, times the images' width in px",
 }
@@ -125,7 +125,9 @@ def opencv_or_ros(
     elif not {*MATRIX_KEYS, *_PROJECTION_KEYS}.isdisjoint(fields):
         unknown = [*filter(_OF_CAMERA.match, unknown)]
     if unknown:
-        remedy = next((words for form, words in _INSTEAD.items() if re.search(form, unknown[0])), _RENAME)
+        has_focal = not {"fx", "fy", *MATRIX_KEYS, *_PROJECTION_KEYS}.isdisjoint(fields)
+        instead = {} if has_focal else _INSTEAD
+        remedy = next((words for form, words in instead.items() if re.search(form, unknown[0])), _RENAME)
         raise ValueError(
             f"unknown key {shown(unknown[0])}; expected fx, fy, cx, cy, width, height, distortion, model, or "
             f"camera_matrix and distortion_coefficients; {remedy}"

@@ -165,11 +165,16 @@ def test_kitti_file_of_an_unknown_camera_needs_a_size(tmp_path):
         ({"distortion": 0.3}, "distortion: expected a list"),
         ({"distortion": [-900.0, 0, 0, 0]}, "lens that can be inverted"),
         ({"model": "catadioptric"}, "model: expected one of pinhole"),
+        ({"focal": 3}, "unknown key 'focal'; .*; rename it, or leave it out"),
+        ({"fov": 90}, "unknown key 'fov'; .*; rename it, or leave it out"),
         (
-            {"focal": 3},
+            {"fx": None, "fy": None, "focal": 3},
             "unknown key 'focal'; .*; fx is the focal length over the sensor's width, in mm, times",
         ),
-        ({"fov": 90}, "unknown key 'fov'; .*; give the horizontal field of view by --fov DEGREES"),
+        (
+            {"fx": None, "fy": None, "fov": 90},
+            "unknown key 'fov'; .*; give the horizontal field of view by --fov DEGREES",
+        ),
     ],
 )
 def test_bad_entries_are_one_clear_line(tmp_path, change, message):

@@ -62,14 +62,15 @@ def test_epochs_of_random_views_have_no_end(tmp_path, capsys, more):
     assert said in capsys.readouterr().err
 
 
-def test_epochs_of_some_batches_end(tmp_path):
+@pytest.mark.parametrize("limit", ["limit_train_batches", "overfit_batches"])
+def test_epochs_of_some_batches_end(tmp_path, limit):
     run(
         "fit",
         "fast.yaml",
         tmp_path,
         "--trainer.max_steps=-1",
         "--trainer.max_epochs=1",
-        "--trainer.limit_train_batches=1",
+        f"--trainer.{limit}=1",
     )
 
 
