@@ -21,20 +21,22 @@ class LaneDoubts:
     """Notices polylines of other images, or of unequal lanes; logs it once, as long as it lasts.
 
     Attributes:
-        doubt: the doubt about the last frames that were judged, in words; empty if there is none.
+        doubt: the doubt about the last frames that were judged, or about the contrast in one of each
+            _LOOKED_AT since the beginning, since those of a second look alike; empty if there is none.
     """
 
     def __init__(self, camera: Camera) -> None:
         self.doubt = ""
         self._camera = camera
         self._drawn: list[FrameLines] = []
-        self._contrast = LaneContrast()
+        self._contrast, self._judged = LaneContrast(), 0
 
     def add(self, lines: FrameLines, image: NDArray[np.uint8] | None = None) -> None:
         """Take the polylines of one frame (H, W, 3), and judge all since the last time if they are enough."""
         if not lines.lines:
             return
-        self._contrast.add(len(self._drawn), image, (line.points for line in lines.lines))
+        if not self._drawn:
+            self._contrast.add(self._judged, image, (line.points for line in lines.lines))
         self._drawn.append(lines)
         if len(self._drawn) < _LOOKED_AT:
             return
@@ -44,4 +46,5 @@ class LaneDoubts:
         words = words or unequal_lanes_remark(self._drawn, self._camera)
         if words and not self.doubt:
             logger.warning(words)
-        self.doubt, self._drawn, self._contrast = words, [], LaneContrast()
+        self.doubt, self._drawn = words, []
+        self._judged += 1

@@ -8,6 +8,9 @@ import pytest
 
 from lanebev import Session
 from lanebev.io.lanes.contrast import LaneContrast, share_of_less_contrast
+from lanebev.io.lanes.doubts import LaneDoubts
+from lanebev.io.lanes.parsing import FrameLines
+from lanebev.observation.polylines import LaneLine
 from tests.app.straight_road import CAMERA, HEIGHT, WIDTH, lane_lines, run
 
 FRAMES = 12
@@ -90,9 +93,17 @@ def test_a_run_says_it(tmp_path, capsys):
 
 
 def test_a_session_with_images_says_it():
-    for shift, is_noticed in ((0.0, False), (-20.0, True)):
-        session = Session(CAMERA)
-        polylines = [np.add(points, (0.0, shift)) for points in POINTS]
-        for number in range(20):
-            reasons = session(_image(number), number / 20, polylines=polylines).reasons
-        assert any("images show no lines where they are" in reason for reason in reasons) == is_noticed
+    session, image = Session(CAMERA, grid=None), _image(0)
+    polylines = [np.add(points, (0.0, -20.0)) for points in POINTS]
+    for number in range(160):
+        reasons = session(image, number / 20, polylines=polylines).reasons
+    assert any("images show no lines where they are" in reason for reason in reasons)
+
+
+def test_a_second_without_paint_is_no_doubt():
+    """Frames of a second look alike: they tell no more than one of them."""
+    doubts, plain, painted = LaneDoubts(CAMERA), _image(0, level=80), _image(0)
+    lines = FrameLines("", [LaneLine(points) for points in POINTS])
+    for number in range(400):
+        doubts.add(lines, plain if 100 <= number < 140 else painted)
+        assert doubts.doubt == ""
