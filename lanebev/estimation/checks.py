@@ -107,12 +107,15 @@ def mask_invalid_rows(
     Args:
         segments: unchecked segments, see :func:`clean_segments`.
         intrinsics: (B, 3, 3), unusable where not finite, transposed or without a positive focal length.
-        lane_width: (B, M) m, unusable where one is not in LANE_WIDTHS, as in feet or cm.
+        lane_width: (B, M) m, unusable where one is not positive, or their mean is not in LANE_WIDTHS, as in
+            feet or cm.
         num_boundaries: L.
     """
     segments = clean_segments(segments, num_boundaries)
     least, most = LANE_WIDTHS
-    good = usable_cameras(intrinsics) & ((lane_width >= least) & (lane_width <= most)).all(-1)  # (B,)
+    mean = lane_width.mean(-1)
+    likely = (lane_width > 0).all(-1) & (mean >= least) & (mean <= most)  # false on NaN
+    good = usable_cameras(intrinsics) & likely  # (B,)
     weight = torch.where(good.unsqueeze(-1), segments.weight, 0.0)
     return (
         segments._replace(weight=weight),

@@ -50,6 +50,14 @@ def test_a_row_with_an_impossible_lane_width_does_not_start(calibrator, width):
 
 
 @CALIBRATORS
+@pytest.mark.parametrize("width", [0.9, 12.0])
+def test_one_narrow_strip_or_wide_gap_among_lanes_is_possible(calibrator, width):
+    widths = torch.tensor([[3.7, 3.7, 3.7, 3.7, width]])
+    out, _ = calibrator(lanes(), K[None], calibrator.initial_state(1), 1 / 30, widths)
+    assert out.status.tolist() == [Status.TRACKING]
+
+
+@CALIBRATORS
 @pytest.mark.parametrize("kind", ["nan", "index", "weight"])
 def test_what_cannot_be_used_keeps_no_row_from_starting(calibrator, kind):
     junk = lanes(per=40)
