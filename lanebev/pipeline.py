@@ -13,6 +13,7 @@ from torch import Tensor, nn
 
 from lanebev.batch import select_rows
 from lanebev.clips import drive_starts, frame_cameras, per_frame
+from lanebev.estimation.calibrator import Calibrator
 from lanebev.estimation.expected_view import expected_vanishing_point
 from lanebev.geometry.lens import check_distortion
 from lanebev.geometry.precision import autocast_is_on, autocast_off, common_dtype
@@ -253,7 +254,7 @@ class LaneBEV(BoundaryDetector):
             camera = cameras[:, step]
             with self._gradients("calibrator"):
                 calibration, state = self.calibrator(segments, camera, state, intervals[:, step], lane_width)
-                calibration = calibration.with_std_scaled(self.pose_sigma_scale)
+                calibration = self._scaled(calibration, state)
                 if speeds is not None:
                     state = with_speed(state, speeds[:, step])
             view, valid = None, None
@@ -264,6 +265,12 @@ class LaneBEV(BoundaryDetector):
             outputs.append(LaneBEVOutput(view, valid, calibration, homography, segments, logits))
         output = outputs[0] if image.ndim == 4 else join_tensors(lambda each: torch.stack(each, 1), outputs)
         return output, state
+
+    def _scaled(self, calibration: Calibration, state: Any) -> Calibration:
+        """Scale the standard deviations of the pose by the network's factor."""
+        if not isinstance(self.calibrator, Calibrator):
+            return calibration.with_std_scaled(self.pose_sigma_scale)
+        return self.calibrator.scale_drive(calibration, state, self.pose_sigma_scale)
 
     def _check_channels(self, logits: Tensor) -> None:
         """Raise unless the network has a map of each boundary that the calibrator numbers, and background."""

@@ -190,6 +190,16 @@ class Calibrator(nn.Module, Generic[StateT]):
         """
         return calibration.with_std_scaled(factor)
 
+    def scale_drive(self, calibration: Calibration, state: StateT, factor: float) -> Calibration:
+        """Scale the standard deviations of a drive's pose, whose detector's errors last over frames.
+
+        Args:
+            calibration: calibration of a frame.
+            state: state after it, before :meth:`with_speed`.
+            factor: factor on the standard deviations of what the frames tell of the pose.
+        """
+        return calibration.with_std_scaled(factor)
+
     def curvature(self, state: StateT) -> Tensor | None:
         """Return the road's curvature at the camera, (B,) 1/m, positive to the right, or None."""
         return None

@@ -60,7 +60,7 @@ class Tracker(Generic[StateT]):
         self.state: StateT = calibrator.initial_state(1, dtype=torch.float64)
         self.mount_state: MountState = self.mount_estimator.initial_state(1, dtype=torch.float64)
         self.mount: MountCalibration | None = None  # after a first frame
-        self.unscaled_covariance: Tensor = torch.zeros(1, 4, 4)  # that of the last frame, before any scaling
+        self.own_covariance: Tensor = torch.zeros(1, 4, 4)  # of the last frame, without the common errors
 
     def states(self) -> dict[str, StateT | MountState]:
         """Return the states by name."""
@@ -81,11 +81,10 @@ class Tracker(Generic[StateT]):
         segments = camera_segments(vertices, self.camera)
         intrinsics = self.camera.intrinsics[None]
         calibration, self.state = self.calibrator(segments, intrinsics, self.state, dt, self.lane_width)
+        calibration = self.calibrator.scale_drive(calibration, self.state, pose_sigma_scale)
         if speed is not None:
             self.state = self.calibrator.with_speed(self.state, speed)
-        self.unscaled_covariance = calibration.covariance
-        output = self.with_output_covariance(calibration, pose_sigma_scale)
-        calibration = calibration.with_std_scaled(pose_sigma_scale)
+        self.own_covariance = calibration.covariance
         mount, self.mount_state = self.mount_estimator(
             calibration,
             self.mount_state,
@@ -95,7 +94,8 @@ class Tracker(Generic[StateT]):
         )
         self.mount = mount._replace(covariance=mount.covariance + self._common_error(mount.extrinsics))
         reasons = Reason(int(self.calibrator.reasons(self.state)[0]))
-        return Estimate(segments, output, reasons, self.calibrator.vertical_curvature(self.state))
+        vertical_curvature = self.calibrator.vertical_curvature(self.state)
+        return Estimate(segments, self.with_common_errors(calibration), reasons, vertical_curvature)
 
     def still(self, vertices: BoundaryVertices, pose_sigma_scale: float) -> Estimate:
         """Estimate the pose of a single image; the states do not change.
@@ -111,7 +111,7 @@ class Tracker(Generic[StateT]):
         )
         calibration = self.calibrator.scale_still(calibration, pose_sigma_scale)
         reasons = Reason(int(self.calibrator.reasons(state)[0])) & ~Reason.RESTARTED  # as every image does
-        return Estimate(segments, self.with_output_covariance(calibration, 1.0), reasons)
+        return Estimate(segments, self.with_common_errors(calibration), reasons)
 
     def vanishing_point(self) -> Tensor:
         """Return where the lanes are expected to meet in the next image, (1, 2) px as taken, or NaN."""
@@ -141,12 +141,7 @@ class Tracker(Generic[StateT]):
             common = common + focal_covariance(extrinsics, self.camera.intrinsics[None], self.focal_std)
         return common
 
-    def with_output_covariance(self, calibration: Calibration, pose_sigma_scale: float) -> Calibration:
-        """Return a calibration whose covariance has all errors in it: scaled, and with the common ones.
-
-        Args:
-            calibration: result of the calibrator.
-            pose_sigma_scale: factor on the standard deviations of the pose.
-        """
-        scaled = calibration.with_std_scaled(pose_sigma_scale)
-        return scaled._replace(covariance=scaled.covariance + self._common_error(calibration.extrinsics))
+    def with_common_errors(self, calibration: Calibration) -> Calibration:
+        """Return a calibration whose covariance contains the errors by focal length and lane width."""
+        common = self._common_error(calibration.extrinsics)
+        return calibration._replace(covariance=calibration.covariance + common)

@@ -29,6 +29,7 @@ from lanebev.estimation.joint.output import (
     vertical_moment,
     wander_of_two,
 )
+from lanebev.estimation.mount.config import MountConfig
 from lanebev.testing.moments import CAMERA, PLACES, WIDTH, moments
 from lanebev.testing.moments import observe as see
 from lanebev.testing.segments import stack_rows
@@ -376,3 +377,38 @@ def test_skipped_and_unsupported_frames_keep_the_scatter_and_rows_are_independen
         assert (after.scatter == state.scatter).all()
         assert (after.pose_sensitivity == state.pose_sensitivity).all()
     assert (skipped.heading_sensitivity == state.heading_sensitivity).all()
+
+
+@pytest.mark.parametrize(("visible", "roll"), [((1, 2, 3), 1.0), ((2, 3, 4), -2.0), ((1, 2, 3, 4), 1.0)])
+def test_a_detectors_factor_is_not_applied_to_the_prior_of_roads(visible, roll):
+    """Two lanes do not show whether they are equal; four boundaries do."""
+    drive = moments(1.0, lambda t, m: replace(m, visible=visible, far=40.0, pose=_rolled(m.pose, roll)))
+    state = CALIBRATOR.initial_state(1, DOUBLE)
+    for _, seen in see(drive, 1, 1.0, 12, 4, DOUBLE):
+        out, state = CALIBRATOR(seen, CAMERA[None], state, ONE_FRAME, WIDTH)
+    scaled, every = CALIBRATOR.scale_drive(out, state, 2.25), out.with_std_scaled(2.25)
+    assert torch.linalg.eigvalsh(scaled.covariance - out.covariance).min() > 0
+    less = every.covariance - scaled.covariance
+    assert torch.linalg.eigvalsh(less).min() > -1e-15
+    of_roll, of_all = (each.covariance[0, ROLL, ROLL].sqrt() for each in (scaled, every))
+    assert of_roll < 0.6 * of_all if len(visible) == 3 else of_roll == of_all
+    assert scaled.covariance[0, PITCH, PITCH] > 0.95 * every.covariance[0, PITCH, PITCH]
+    same = CALIBRATOR.scale_drive(out, state, 1.0)
+    assert torch.equal(same.covariance, out.covariance)
+    assert torch.equal(scaled.extrinsics.stack(), out.extrinsics.stack())
+
+
+def _rolled(pose, degrees):
+    pitch, yaw, roll, height = pose
+    return (pitch, yaw, roll + math.radians(degrees), height)
+
+
+def test_the_roll_of_a_mount_is_found_with_two_lanes_in_view():
+    """A frame's standard deviation must be small enough for the mount estimate, with a network's factor."""
+    drive = moments(2.0, lambda t, m: replace(m, visible=(1, 2, 3), far=40.0, pose=_rolled(m.pose, 1.0)))
+    state = CALIBRATOR.initial_state(1, DOUBLE)
+    for _, seen in see(drive, 1, 1.0, 12, 4, DOUBLE):
+        out, state = CALIBRATOR(seen, CAMERA[None], state, ONE_FRAME, WIDTH)
+    largest = MountConfig().largest_std[ROLL]
+    assert CALIBRATOR.scale_drive(out, state, 2.25).covariance[0, ROLL, ROLL].sqrt() < largest
+    assert out.with_std_scaled(2.25).covariance[0, ROLL, ROLL].sqrt() > largest

@@ -141,8 +141,8 @@ def replay(calibrator: Calibrator[Any], recordings: Sequence[Recording]) -> Repl
         for k in range(len(dt)):
             now = LaneSegments(*(part[k] for part in segments))
             answer, state = calibrator(now, intrinsics, state, dt[k], widths)
+            answer = _scaled(calibrator, answer, state, scale)
             state = calibrator.with_speed(state, speed[k])
-            answer = answer._replace(covariance=scale[:, None, None].square() * answer.covariance)
             bend = calibrator.curvature(state)
             mounted, mount_state = mount(answer, mount_state, dt[k], curvature=bend)
             answers.append(answer)
@@ -155,6 +155,13 @@ def replay(calibrator: Calibrator[Any], recordings: Sequence[Recording]) -> Repl
         reasons=torch.stack(reasons),
         mounts=mounts,
     )
+
+
+def _scaled(calibrator: Calibrator[Any], answer: Calibration, state: Any, scale: Tensor) -> Calibration:
+    """Scale the standard deviations of every row by its factor (R,)."""
+    for factor in set(scale.tolist()):
+        answer = select_rows(scale == factor, calibrator.scale_drive(answer, state, factor), answer)
+    return answer
 
 
 def _first_states(calibrator: Calibrator[Any], recordings: Sequence[Recording]) -> Any:

@@ -123,7 +123,7 @@ def smooth_frames(
             tracker.drive_frame(seen.vertices, frame.dt, seen.pose_sigma_scale, frame.speed)
             states.append(cast(JointState, tracker.state))
             intervals.append(np.array([frame.dt]))
-            covariances.append(tracker.unscaled_covariance[0].double().cpu().numpy())
+            covariances.append(tracker.own_covariance[0].double().cpu().numpy())
             scales.append(np.array([seen.pose_sigma_scale]))
     return _smoothed(states, intervals, covariances, scales, tracker, config)
 
@@ -141,7 +141,7 @@ def _smoothed(
     Args:
         states: after every frame.
         intervals: s from the frame before.
-        covariances: covariances of the pose as the calibrator gave it.
+        covariances: covariances of the pose, scaled.
         scales: factor on the standard deviations of the pose.
         tracker: tracker that gave the states.
         config: configuration of its calibrator.
@@ -151,11 +151,12 @@ def _smoothed(
     backward = zip(range(count - 1, -1, -1), smooth_states(states, steps, config), strict=True)
     for number, smoothed in backward:
         state = states[number]
-        given = torch.from_numpy(covariances.all()[number : number + 1].copy())
+        scale = float(scales.all()[number, 0])
+        given = torch.from_numpy(covariances.all()[number : number + 1] / scale**2)
         pose, no_inliers = Extrinsics.unstack(state.mean[:, POSE]), given.new_zeros(1, 0)
         filtered = Calibration(pose, given, state.status, no_inliers)
-        scale = float(scales.all()[number, 0])
-        calibration = tracker.with_output_covariance(smoothed_calibration(filtered, state, smoothed), scale)
+        calibration = smoothed_calibration(filtered, state, smoothed).with_std_scaled(scale)
+        calibration = tracker.with_common_errors(calibration)
         result.poses[number] = calibration.extrinsics.stack()[0].numpy()
         result.covariances[number] = calibration.covariance[0].numpy()
         result.vertical_curvatures[number] = float(smoothed.mean[0, VERTICAL])

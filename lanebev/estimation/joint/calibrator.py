@@ -29,7 +29,7 @@ from lanebev.estimation.joint.layout import NUM_COMMON, STEPS, layout
 from lanebev.estimation.joint.measurement.observations import boundary_places, observations
 from lanebev.estimation.joint.measurement.residuals import CURVATURE, VERTICAL
 from lanebev.estimation.joint.measurement.road_curve import KNOT_SPACING
-from lanebev.estimation.joint.output import as_calibration
+from lanebev.estimation.joint.output import as_calibration, scaled_covariance
 from lanebev.estimation.joint.state import JointState
 from lanebev.estimation.reasons import Reason
 from lanebev.geometry.precision import autocast_off, cast_floating, widest_dtype
@@ -150,6 +150,14 @@ class JointCalibrator(Calibrator[JointState]):
         pose, covariance = (select_rows(begun, *both) for both in zip(tempered, (pose, like), strict=True))
         scaled = calibration._replace(extrinsics=Extrinsics.unstack(pose), covariance=covariance)
         return cast_floating(scaled, given.dtype)
+
+    def scale_drive(self, calibration: Calibration, state: JointState, factor: float) -> Calibration:
+        """Multiply the standard deviations of a drive's pose, except those by deviations not seen (J36)."""
+        given = calibration.covariance
+        like = given.to(widest_dtype(given.device))
+        with autocast_off(like.device, like.dtype):
+            scaled = scaled_covariance(like, cast_floating(state, like.dtype), self.config, factor)
+        return cast_floating(calibration._replace(covariance=scaled), given.dtype)
 
     def curvature(self, state: JointState) -> Tensor:
         """Return the road's curvature at the camera, (B,) 1/m, positive to the right."""

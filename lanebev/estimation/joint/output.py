@@ -187,6 +187,29 @@ def heading_variance(state: JointState, of_scatter: Tensor, of_two: Tensor, cfg:
     return of_two + torch.where(more_than_two, of_more, 0.0)
 
 
+def place_variances(state: JointState, cfg: JointConfig) -> tuple[Tensor, Tensor]:
+    """Compute the variances (B, L) m² of the boundaries' deviations that the filter's covariance lacks.
+
+    Source: (J26), (J28), (J35).
+
+    Args:
+        state: (B, ...).
+        cfg: the configuration.
+
+    Returns:
+        what frames have shown of them, and what is possible because too few boundaries are in view; the
+        larger one counts.
+    """
+    own = layout(cfg.num_boundaries).deviations
+    deviations, variances = state.mean[:, own], state.cov.diagonal(dim1=1, dim2=2)[:, own]
+    of_places, of_headings = scatter_variance(state.scatter).unbind(-1)
+    shown = single_deviation(deviations, cfg).maximum(learned_deviation(state.places, deviations, cfg))
+    shown = of_places.unsqueeze(-1).maximum(beyond_filter(shown.unsqueeze(-1), variances))
+    roll = state.mean[:, ROLL]
+    unverified = unverified_deviation(state.pose_sensitivity, deviations, of_headings, roll, cfg)
+    return shown.expand_as(unverified), beyond_filter(unverified, variances)
+
+
 def covariance_by_boundaries(state: JointState, of_two: Tensor, cfg: JointConfig) -> Tensor:
     """Compute the covariance (B, 4, 4) of the pose by the boundaries' own deviations and headings.
 
@@ -197,17 +220,39 @@ def covariance_by_boundaries(state: JointState, of_two: Tensor, cfg: JointConfig
         of_two: (B,) rad² of :func:`wander_of_two`.
         cfg: the configuration.
     """
-    own = layout(cfg.num_boundaries).deviations
-    deviations, variances = state.mean[:, own], state.cov.diagonal(dim1=1, dim2=2)[:, own]
-    of_places, of_headings = scatter_variance(state.scatter).unbind(-1)
-    by_place, by_heading = state.pose_sensitivity, state.heading_sensitivity[:, POSE]
-    unverified = unverified_deviation(by_place, deviations, of_headings, state.mean[:, ROLL], cfg)
-    learned = learned_deviation(state.places, deviations, cfg)
-    expected = single_deviation(deviations, cfg).maximum(learned).unsqueeze(-1).maximum(unverified)
-    of_places = of_places.unsqueeze(-1).maximum(beyond_filter(expected, variances))  # (B, L)
-    of_headings = heading_variance(state, of_headings, of_two, cfg)[:, None, None]
-    covariance = torch.bmm(of_places.unsqueeze(1) * by_place, by_place.mT)
-    return covariance + of_headings * torch.bmm(by_heading, by_heading.mT)
+    of_places = torch.maximum(*place_variances(state, cfg))
+    of_headings = heading_variance(state, scatter_variance(state.scatter)[:, 1], of_two, cfg)
+    by_heading = state.heading_sensitivity[:, POSE]
+    covariance = by_places(state.pose_sensitivity, of_places)
+    return covariance + of_headings[:, None, None] * torch.bmm(by_heading, by_heading.mT)
+
+
+def by_places(sensitivity: Tensor, variances: Tensor) -> Tensor:
+    """Compute the covariance (B, 4, 4) of the pose by deviations of the boundaries.
+
+    Args:
+        sensitivity: (B, 4, L), change of the pose per metre.
+        variances: (B, L) m².
+    """
+    return torch.bmm(variances.unsqueeze(1) * sensitivity, sensitivity.mT)
+
+
+def scaled_covariance(covariance: Tensor, state: JointState, cfg: JointConfig, factor: float) -> Tensor:
+    """Multiply standard deviations of a drive's pose by a factor, except those by deviations not seen.
+
+    Source: (J36). The factor is that of a detector's errors. That lanes may differ, or a line bound no lane,
+    where too few boundaries are in view to tell, is a prior of roads.
+
+    Args:
+        covariance: (B, 4, 4) of :func:`as_calibration`.
+        state: (B, ...), of the same frame.
+        cfg: the configuration.
+        factor: on the standard deviations.
+    """
+    shown, unverified = place_variances(state, cfg)
+    scaled = torch.maximum(factor**2 * shown, unverified)
+    less = factor**2 * torch.maximum(shown, unverified) - scaled
+    return factor**2 * covariance - by_places(state.pose_sensitivity, less)
 
 
 def height_variance_by_roll(height: Tensor, left: Tensor, right: Tensor, roll_variance: Tensor) -> Tensor:
