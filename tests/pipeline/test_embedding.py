@@ -449,7 +449,7 @@ def test_a_whole_model_is_recorded_by_torch_jit_trace():
 def test_a_model_on_the_device_meta_has_the_shapes_of_its_results(calibrator):
     """As a tool that counts operations runs it."""
     made = small_model().eval()
-    made.calibrator = calibrator
+    made.calibrator = copy.deepcopy(calibrator)
     made = made.to("meta")
     out, state = made(torch.rand(2, 3, 64, 128, device="meta"), CAMERA.repeat(2, 1, 1).to("meta"))
     assert out.bev.shape == (2, 3, *made.warp.grid.shape)
