@@ -171,7 +171,8 @@ def _sample(features: Tensor, at: Tensor) -> Tensor:
     """Sample (B, C, h, w) bilinearly at (B, 2, R, V), zero where that lies outside, in its dtype.
 
     OpenCV divides one image among threads, which ``grid_sample`` does not, and waits for none that is late.
-    The coordinates are overwritten then. Between two infinite values its result is NaN.
+    The coordinates are overwritten then. Between infinite values its result would be NaN, so it does not
+    sample maps that have some.
     """
     dtype, features = features.dtype, features.to(at.dtype)
     by_opencv = (

@@ -153,6 +153,8 @@ class JointCalibrator(Calibrator[JointState]):
 
     def scale_drive(self, calibration: Calibration, state: JointState, factor: float) -> Calibration:
         """Multiply the standard deviations of a drive's pose, except those by deviations not seen (J36)."""
+        if factor == 1:
+            return calibration
         given = calibration.covariance
         like = given.to(widest_dtype(given.device))
         with autocast_off(like.device, like.dtype):

@@ -6,10 +6,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-_EDGE, _WITHIN = (
-    1 / 400,
-    1 / 160,
-)  # fractions of the width: half that of an edge, and how far off a line may be
+_EDGE = 1 / 400  # fraction of the width, half that of an edge
+_WITHIN = 1 / 160  # likewise, by which a line may be beside its edge
 _STEP, _STEPS = 0.01, 20  # fraction of the width by which a line is moved, and how often to each side
 _CLOSE = 1  # steps, that are not compared
 _STRONGEST = 4.0  # times the row's mean, the contrast of an edge that counts
