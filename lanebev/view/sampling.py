@@ -58,7 +58,12 @@ def resampled(
     """
     at = sampling_maps(cells, lens, sizes, image_size)
     valid = _at_most_one(at[0][:, :1])
-    return [_sample(each, where) for each, where in zip(maps, at, strict=True)], valid
+    if all(map(_is_for_opencv, maps, at)):
+        sampled = [_remapped(each, where) for each, where in zip(maps, at, strict=True)]
+        if all(map(_is_finite, sampled)):
+            return sampled, valid
+        at = sampling_maps(cells, lens, sizes, image_size)  # they were overwritten
+    return [_grid_sample(each, where) for each, where in zip(maps, at, strict=True)], valid
 
 
 def _at_most_one(values: Tensor) -> Tensor:
@@ -167,36 +172,41 @@ def map_coordinate(
     return F.hardtanh(coordinate, -centre, centre)  # whose gradient takes a sixth of the time
 
 
-def _sample(features: Tensor, at: Tensor) -> Tensor:
-    """Sample (B, C, h, w) bilinearly at (B, 2, R, V), zero where that lies outside, in its dtype.
-
-    OpenCV divides one image among threads, which ``grid_sample`` does not, and waits for none that is late.
-    The coordinates are overwritten then. Between infinite values its result would be NaN, so it does not
-    sample maps that have some.
-    """
-    dtype, features = features.dtype, features.to(at.dtype)
-    by_opencv = (
+def _is_for_opencv(features: Tensor, at: Tensor) -> bool:
+    """Tell whether OpenCV samples as :func:`_grid_sample` does: without gradients, on the CPU."""
+    return (
         _may_overwrite()
         and (at.device.type, at.dtype) == ("cpu", torch.float32)
         and _OPENCV_IS_EXACT
         and max(*features.shape[2:], *at.shape[2:]) < _MOST_SIDE
-        and bool(features.sum().isfinite())
     )
-    return (_remapped if by_opencv else _grid_sample)(features, at).to(dtype)
 
 
 @one_thread()  # of PyTorch; OpenCV uses its own
 def _remapped(features: Tensor, at: Tensor) -> Tensor:
+    """Sample as :func:`_grid_sample`, one image divided among threads; none waits for one that is late.
+
+    The coordinates are overwritten. Between infinite values the result is NaN.
+    """
     for plane, side in zip(at.unbind(1), reversed(features.shape[2:]), strict=True):
         # to pixels, rounded as by grid_sample
         torch.add(plane.new_tensor(-0.5), plane.add_(1), alpha=side / 2, out=plane)
     sampled = at.new_empty(*features.shape[:2], *at.shape[2:])
-    images = features.contiguous().numpy(force=True)
+    images = features.to(at.dtype).contiguous().numpy(force=True)
     for image, (x, y), bev in zip(images, at.numpy(), sampled.numpy(), strict=True):
         for channel, out in zip(image, bev, strict=True):
             cv2.remap(channel, x, y, cv2.INTER_LINEAR, out)
-    return sampled
+    return sampled.to(features.dtype)
+
+
+@one_thread()
+def _is_finite(values: Tensor) -> bool:
+    return bool(values.sum(dtype=torch.float32).isfinite())  # half precision would overflow
 
 
 def _grid_sample(features: Tensor, at: Tensor) -> Tensor:
-    return F.grid_sample(features, at.movedim(1, -1), "bilinear", "zeros", align_corners=False)
+    """Sample (B, C, h, w) bilinearly at (B, 2, R, V), zero where that lies outside, in its dtype."""
+    at = at.movedim(1, -1)
+    return F.grid_sample(features.to(at.dtype), at, "bilinear", "zeros", align_corners=False).to(
+        features.dtype
+    )
