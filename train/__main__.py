@@ -78,8 +78,8 @@ class CommandLine(LightningCLI):
         has_end = counted or limits.max_time is not None
         if not has_end and limits.max_steps == -1 and limits.max_epochs not in (-1, 0):  # -1: without end
             raise ValueError(
-                "max_steps: expected the number of steps, since random views never end an epoch, got -1; "
-                "give it, or with max_epochs the steps of an epoch, --trainer.limit_train_batches"
+                "max_steps: expected a number of steps, since an epoch of random views never ends, got -1; "
+                "give --trainer.max_steps, or --trainer.limit_train_batches, the steps of an epoch"
             )
         on_cpu = isinstance(self.trainer.accelerator, CPUAccelerator)
         half = on_cpu and self.trainer.precision.startswith("bf16")

@@ -25,7 +25,7 @@ from train.data import Batch, Seed, ViewBatches, run_position
 from train.labels import LabelledImage, ViewConfig, full_view
 
 _LOOKED_AT = 20  # entries, for the size and the contrast of their images
-_REMEDY = "take the images that were labelled, or convert the labels to pixels of these"
+_REMEDY = "give the images that were labelled, or convert the labels to pixels of the given images"
 Format = Literal["tusimple", "culane", "openlane"]
 
 

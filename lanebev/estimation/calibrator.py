@@ -191,7 +191,7 @@ class Calibrator(nn.Module, Generic[StateT]):
         return calibration.with_std_scaled(factor)
 
     def scale_drive(self, calibration: Calibration, state: StateT, factor: float) -> Calibration:
-        """Scale the standard deviations of a drive's pose, whose detector's errors last over frames.
+        """Scale the standard deviations of a drive's pose for a detector whose errors repeat over frames.
 
         Args:
             calibration: calibration of a frame.

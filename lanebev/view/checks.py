@@ -126,9 +126,8 @@ def check_cameras(
 def doubt_intrinsics(intrinsics: Tensor, size: tuple[int, int]) -> None:
     """Warn if the principal points are at the upper left or lower right corner of images, or beyond.
 
-    Intrinsics of a smaller or larger image are so: of one that was resized, or of that which a feature map
-    covers; also intrinsics in shares of the sides, and inverted ones. Where reading numbers would wait for a
-    device, there is no warning.
+    Such intrinsics are those of an image before it was resized, or of the image that a feature map covers,
+    fractions of the sides, or inverted. Where reading numbers would wait for a device, there is no warning.
 
     Args:
         intrinsics: (..., 3, 3) px.
@@ -145,8 +144,8 @@ def doubt_intrinsics(intrinsics: Tensor, size: tuple[int, int]) -> None:
     for corner, is_there in at_corners.items():
         if bool(is_there.all()):
             warnings.warn(
-                f"intrinsics: expected those of the image, in pixels, got a principal point at its {corner} "
-                "corner or beyond: scale them as the image, or give image_size=(H, W) of the image with a "
-                "feature map",
+                "intrinsics: expected the intrinsics of the image in pixels, got a principal point at or "
+                f"beyond its {corner} corner; scale the intrinsics as the image was, or with a feature map "
+                "give image_size=(H, W) of the image",
                 stacklevel=2,
             )

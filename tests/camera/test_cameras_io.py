@@ -169,7 +169,7 @@ def test_kitti_file_of_an_unknown_camera_needs_a_size(tmp_path):
         ({"fov": 90}, "unknown key 'fov'; .*; rename it, or leave it out"),
         (
             {"fx": None, "fy": None, "focal": 3},
-            "unknown key 'focal'; .*; fx is the focal length over the sensor's width, in mm, times",
+            "unknown key 'focal'; .*; fx is focal length / sensor width \\(both in mm\\) times",
         ),
         (
             {"fx": None, "fy": None, "fov": 90},

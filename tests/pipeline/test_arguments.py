@@ -366,7 +366,7 @@ def test_tensors_on_different_devices_are_named(model):
 
 def test_intrinsics_of_a_larger_image_are_doubted(model):
     """Of an image that was made smaller, or of that of a feature map whose image_size was forgotten."""
-    features, doubt = torch.rand(1, 4, 45, 80), "a principal point at its lower right corner or beyond"
+    features, doubt = torch.rand(1, 4, 45, 80), "a principal point at or beyond its lower right corner"
     for view in (BEVWarp(GRID), lanebev.CanonicalView(K[0], (360, 640), POSE)):
         with pytest.warns(UserWarning, match=doubt):
             view(features, K, POSE)
@@ -383,7 +383,9 @@ def test_intrinsics_of_a_larger_image_are_doubted(model):
 def test_intrinsics_of_a_smaller_image_are_doubted(model, scale):
     """Pitch and yaw would be tens of degrees off, and called TRACKING."""
     smaller = torch.cat([scale * SMALL_K[:, :2], SMALL_K[:, 2:]], 1)
-    with pytest.warns(UserWarning, match="in pixels, got a principal point at its upper left corner"):
+    with pytest.warns(
+        UserWarning, match="in pixels, got a principal point at or beyond its upper left corner"
+    ):
         model(IMAGE, smaller, bev=False)
     with pytest.warns(UserWarning, match="upper left corner"):
         BEVWarp(GRID)(IMAGE, torch.linalg.inv(SMALL_K), POSE)

@@ -58,7 +58,7 @@ def test_epochs_of_random_views_have_no_end(tmp_path, capsys, more):
     with pytest.raises(SystemExit) as stopped:
         run("fit", "fast.yaml", tmp_path, "--trainer.max_steps=-1", *more)
     assert stopped.value.code == 2
-    said = "error: max_steps: expected the number of steps, since random views never end an epoch, got -1"
+    said = "error: max_steps: expected a number of steps, since an epoch of random views never ends, got -1"
     assert said in capsys.readouterr().err
 
 

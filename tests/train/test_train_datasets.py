@@ -208,10 +208,10 @@ def test_labels_in_pixels_of_other_images_are_noticed(root):
         check_labels(entries)
     with pytest.raises(
         ValueError,
-        match=r"driver/0 and others: lanes: .* of images of another size\? take the",
+        match=r"driver/0 and others: lanes: .* of images of another size\? give the",
     ):
         check_labels(scaled(2.0))
-    with pytest.warns(match=r"driver/0 and others: lanes: none of .*; of smaller images\? take the images"):
+    with pytest.warns(match=r"driver/0 and others: lanes: none of .*; of smaller images\? give the images"):
         check_labels(scaled(0.5))
     with pytest.warns(match=r"of images whose top was cut off\?"):
         check_labels(scaled(1.0, 70.0))
@@ -227,7 +227,9 @@ def test_labels_that_are_not_where_the_images_show_lines_are_noticed(root):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         check_labels(entries)
-    with pytest.warns(match=r"driver/0 and others: lanes: images show no lines where they are; .* take the"):
+    with pytest.warns(
+        match=r"driver/0 and others: lanes: the images show no edges along these lines; .* give the"
+    ):
         check_labels([moved(entry, np.array([-25.0, 0.0])) for entry in entries])
     with pytest.raises(ValueError, match="none of the entries has a line"):
         check_labels([entry._replace(lines=entry.lines._replace(lines=[])) for entry in entries])

@@ -50,8 +50,9 @@ def upside_down_remark(
     if not shares[0] < _SHARE <= shares[1]:
         return ""
     return (
-        f"images: {shares[1]:.0%} of some have a pose if they are turned by 180 degrees, {shares[0]:.0%} as "
-        "they are; if they are upside down, turn them, as by ffmpeg -vf hflip,vflip"
+        f"images: lanes determine a pose in {shares[1]:.0%} of sampled images turned by 180 degrees, in "
+        f"{shares[0]:.0%} of these images as they are; if the images are upside down, turn them, for example "
+        "by ffmpeg -vf hflip,vflip"
     )
 
 

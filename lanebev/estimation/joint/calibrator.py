@@ -152,7 +152,7 @@ class JointCalibrator(Calibrator[JointState]):
         return cast_floating(scaled, given.dtype)
 
     def scale_drive(self, calibration: Calibration, state: JointState, factor: float) -> Calibration:
-        """Multiply the standard deviations of a drive's pose, except those by deviations not seen (J36)."""
+        """Multiply the standard deviations of a drive's pose, except the part for unverified lanes (J36)."""
         if factor == 1:
             return calibration
         given = calibration.covariance

@@ -118,7 +118,7 @@ class JointConfig:
         iterations: Gauss-Newton steps per frame.
         start_iterations: Gauss-Newton steps for every start of a first frame.
         lane_width_std: sigma of the common scale of the lane widths, m; 0: the widths are exact. ``LaneBEV``
-            multiplies its effect on the covariance by ``pose_sigma_scale`` squared, as all of it.
+            also multiplies this part of the covariance by ``pose_sigma_scale`` squared.
         scatter_memory: time constant, s, of the mean squares of the boundaries' own deviations and headings;
             inf: they are taken for 0.
         start_heading_std: standard deviation of a boundary's own heading at a start, rad, unless frames show

@@ -238,10 +238,10 @@ def by_places(sensitivity: Tensor, variances: Tensor) -> Tensor:
 
 
 def scaled_covariance(covariance: Tensor, state: JointState, cfg: JointConfig, factor: float) -> Tensor:
-    """Multiply standard deviations of a drive's pose by a factor, except those by deviations not seen.
+    """Multiply the standard deviations of a drive's pose, except the part for unverified lanes.
 
-    Source: (J36). The factor is that of a detector's errors. That lanes may differ, or a line bound no lane,
-    where too few boundaries are in view to tell, is a prior of roads.
+    Source: (J36). The factor is for errors of a detector. The part that is not multiplied is a prior of
+    roads: with too few boundaries in view, lanes may be unequal or a line may bound no lane.
 
     Args:
         covariance: (B, 4, 4) of :func:`as_calibration`.

@@ -19,7 +19,7 @@ _ALL = 20  # frames that are looked at one by one, then ever fewer
 
 
 class LaneContrast:
-    """Notices lanes of other images, of mirrored ones or of other sizes, by the images themselves.
+    """Notices lanes of other, mirrored or resized images by the contrast along them.
 
     A boundary is an edge between bright and dark. So the contrast along it is larger than along most lines
     beside it.
@@ -52,8 +52,8 @@ class LaneContrast:
         if len(self._shares) < _LEAST_LINES or np.mean(self._shares) >= _LEAST_SHARE:
             return ""
         return (
-            "images show no lines where they are; are they of other images, mirrored, shifted, or in pixels "
-            "of images of another size?"
+            "the images show no edges along these lines; do the lines belong to other, mirrored or shifted "
+            "images, or to images of another size?"
         )
 
 

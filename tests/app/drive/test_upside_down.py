@@ -45,7 +45,7 @@ def test_lanes_that_are_seen_in_turned_images_only_are_said(source):
     observer = NetworkObserver(Bright(), CAMERA)
     remark = upside_down_remark(observer, TRACKER, source, 0, 10)
     assert remark.startswith(
-        "images: 100% of some have a pose if they are turned by 180 degrees, 0% as they are"
+        "images: lanes determine a pose in 100% of sampled images turned by 180 degrees, in 0% of these"
     )
     assert upside_down_remark(observer, TRACKER, source, 6, 10) == ""
     assert upside_down_remark(observer, TRACKER, source, 0, 7) == ""

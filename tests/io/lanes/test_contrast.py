@@ -50,7 +50,7 @@ def _remark(change, images=_image, frames=FRAMES):
     ],
 )
 def test_lines_beside_those_of_the_images_are_noticed(change, is_noticed):
-    assert ("images show no lines where they are" in _remark(change)) == is_noticed
+    assert ("the images show no edges along these lines" in _remark(change)) == is_noticed
 
 
 def test_images_without_contrast_and_few_lines_tell_nothing():
@@ -81,15 +81,12 @@ def test_a_run_says_it(tmp_path, capsys):
         cv2.imwrite(str(tmp_path / name), _image(number))
     (tmp_path / "lanes.json").write_text("\n".join(lane_lines(names)))
     assert run(tmp_path, out=tmp_path / "out") == 0
-    assert "images show no lines" not in capsys.readouterr().out
+    assert "images show no edges" not in capsys.readouterr().out
     lines = [json.loads(text) for text in lane_lines(names)]
     raised = [json.dumps({**line, "h_samples": (ROWS - 20).tolist()}) for line in lines]
     (tmp_path / "raised.json").write_text("\n".join(raised))
     assert run(tmp_path, lanes="raised.json", out=tmp_path / "out") == 0
-    assert (
-        "lanes: images show no lines where they are; are they of other images, mirr"
-        in capsys.readouterr().out
-    )
+    assert "lanes: the images show no edges along these lines; do the lines belong" in capsys.readouterr().out
 
 
 def test_a_session_with_images_says_it():
@@ -97,7 +94,7 @@ def test_a_session_with_images_says_it():
     polylines = [np.add(points, (0.0, -20.0)) for points in POINTS]
     for number in range(160):
         reasons = session(image, number / 20, polylines=polylines).reasons
-    assert any("images show no lines where they are" in reason for reason in reasons)
+    assert any("the images show no edges along these lines" in reason for reason in reasons)
 
 
 def test_a_second_without_paint_is_no_doubt():
