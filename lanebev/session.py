@@ -246,7 +246,7 @@ class Session:
         """Return the frame's vertices and the scale of the pose's sigmas that their detector needs."""
         if polylines is not None or image is None:
             lines = lines_from_polylines([] if polylines is None else polylines, self.polyline_sigma)
-            self._lanes.add(FrameLines("", lines), None if image is None else image_bytes(image))
+            self._lanes.add(FrameLines("", lines), image)
             return vertices_from_lines(lines, self.camera), 1.0
         if self._model is None:
             self._model = LaneBEV.from_pretrained()

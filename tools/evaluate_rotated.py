@@ -12,6 +12,7 @@ of the version's pose.
 
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import NamedTuple
 
 import torch
@@ -20,6 +21,7 @@ from torch import Tensor
 
 from lanebev import Camera, CanonicalView, Extrinsics, LaneBEV, Status
 from lanebev.geometry.rotation import pitch_yaw_roll, road_from_cam
+from lanebev.io.frames import Selection
 from lanebev.io.opening import open_source
 from lanebev.observation.frames import check_frame, network_image
 from tools.network_options import make_model, network_parser
@@ -125,8 +127,8 @@ def follow(model: LaneBEV, source: str, camera: Camera, lane_width: float, every
 
 def _frames(source: str, camera: Camera, every: int) -> Iterator[tuple[Tensor, float]]:
     """Yield every N-th frame (1, 3, H, W) in [0, 1] that decodes, and its time, s."""
-    for frame in open_source(source):
-        if frame.number % every == 0 and frame.image is not None:
+    for frame in replace(open_source(source), selection=Selection(every=every)):
+        if frame.image is not None:
             image = network_image(check_frame(frame.image, camera.image_size), torch.device("cpu"))
             yield image, frame.time
 

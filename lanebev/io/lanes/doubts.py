@@ -2,14 +2,14 @@
 
 import logging
 
-import numpy as np
-from numpy.typing import NDArray
+from torch import Tensor
 
 from lanebev.camera.model import Camera
 from lanebev.io.lanes.contrast import LaneContrast
 from lanebev.io.lanes.parsing import FrameLines
 from lanebev.io.lanes.remarks import unequal_lanes_remark
 from lanebev.io.lanes.size import size_doubt
+from lanebev.observation.frames import image_bytes
 
 _LOOKED_AT = 20  # frames that are judged together
 _REMEDY = "give pixels of the camera's images, or a camera by Camera.scaled or Camera.cropped"
@@ -31,12 +31,12 @@ class LaneDoubts:
         self._drawn: list[FrameLines] = []
         self._contrast, self._judged = LaneContrast(), 0
 
-    def add(self, lines: FrameLines, image: NDArray[np.uint8] | None = None) -> None:
-        """Take the polylines of one frame (H, W, 3), and judge all since the last time if they are enough."""
+    def add(self, lines: FrameLines, image: Tensor | None = None) -> None:
+        """Take the polylines of one frame (3, H, W), and judge all since the last time if they are enough."""
         if not lines.lines:
             return
-        if not self._drawn:
-            self._contrast.add(self._judged, image, (line.points for line in lines.lines))
+        if not self._drawn and image is not None:
+            self._contrast.add(self._judged, image_bytes(image), (line.points for line in lines.lines))
         self._drawn.append(lines)
         if len(self._drawn) < _LOOKED_AT:
             return

@@ -5,6 +5,7 @@ import json
 import cv2
 import numpy as np
 import pytest
+import torch
 
 from lanebev import Session
 from lanebev.io.lanes.contrast import LaneContrast, share_of_less_contrast
@@ -102,5 +103,6 @@ def test_a_second_without_paint_is_no_doubt():
     doubts, plain, painted = LaneDoubts(CAMERA), _image(0, level=80), _image(0)
     lines = FrameLines("", [LaneLine(points) for points in POINTS])
     for number in range(400):
-        doubts.add(lines, plain if 100 <= number < 140 else painted)
+        image = plain if 100 <= number < 140 else painted
+        doubts.add(lines, torch.from_numpy(image).movedim(-1, 0))
         assert doubts.doubt == ""

@@ -1,6 +1,6 @@
 """Objects between the scene and the sensor: the own bonnet, rain in the air, drops on the glass."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
@@ -63,14 +63,14 @@ def rain(image: Tensor, wet: Tensor, generators: Sequence[torch.Generator]) -> T
         generators: R of them, on the images' device.
     """
     batch, _, height, width = image.shape
-    grain = uniform_rows((1, height, width), generators, image.device) > 0.997
-    lean = uniform_rows((), generators, image.device) * 0.4 - 0.2
+    grain = random_rows((1, height, width), generators, image.device) > 0.997
+    lean = random_rows((), generators, image.device) * 0.4 - 0.2
     falling = _streaks(grain.float(), lean) * (0.9 * wet)[:, None, None, None]
     image = image + falling * (0.9 - image)
 
     wide = 0.012 * width
     blurred = gaussian_blur(image, image.new_full((batch,), wide), [blur_reach(wide)] * batch)
-    mask = _drops(wet, uniform_rows((_MOST_DROPS, 3), generators, image.device), (height, width))
+    mask = _drops(wet, random_rows((_MOST_DROPS, 3), generators, image.device), (height, width))
     narrow = 0.0025 * width
     mask = gaussian_blur(mask[:, None], image.new_full((batch,), narrow), [blur_reach(narrow)] * batch)
     shifted = blurred.roll(-(height // 12), dims=2) * 1.05
@@ -112,11 +112,14 @@ def _drops(wet: Tensor, draw: Tensor, size: tuple[int, int]) -> Tensor:
     return drops
 
 
-def uniform_rows(
-    shape: tuple[int, ...], generators: Sequence[torch.Generator], device: torch.device
+def random_rows(
+    shape: tuple[int, ...],
+    generators: Sequence[torch.Generator],
+    device: torch.device,
+    draw: Callable[..., Tensor] = Tensor.uniform_,
 ) -> Tensor:
-    """Draw (R, *shape) uniform values in [0, 1) on the device, which is the generators'."""
+    """Draw (R, *shape) values on the device, which is the generators': uniform in [0, 1) by default."""
     values = torch.empty(len(generators), *shape, device=device)
     for row, generator in zip(values, generators, strict=True):
-        row.uniform_(generator=generator)
+        draw(row, generator=generator)
     return values

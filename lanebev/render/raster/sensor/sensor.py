@@ -7,7 +7,7 @@ from torch import Tensor
 
 from lanebev.render.raster.base.features import Features
 from lanebev.render.raster.paint import Painted
-from lanebev.render.raster.sensor.effects import add_bonnet, rain
+from lanebev.render.raster.sensor.effects import add_bonnet, rain, random_rows
 from lanebev.render.raster.sensor.exposure import expose
 from lanebev.render.raster.sensor.filters import blur_reach, gaussian_blur
 from lanebev.render.raster.sensor.glass import behind_glass, frame_cover, recorded, shaken
@@ -96,19 +96,9 @@ def _blur(image: Tensor, std: Tensor) -> None:
         image.index_copy_(0, rows, gaussian_blur(image.index_select(0, rows), own, reach))
 
 
-def normal_rows(
-    shape: tuple[int, ...], generators: Sequence[torch.Generator], device: torch.device
-) -> Tensor:
-    """Draw (R, *shape) standard normal values on the device, which is the generators'."""
-    values = torch.empty(len(generators), *shape, device=device)
-    for row, generator in zip(values, generators, strict=True):
-        row.normal_(generator=generator)
-    return values
-
-
 def add_noise(image: Tensor, sensor: Sensor, generators: Sequence[torch.Generator]) -> Tensor:
     """Add shot and read noise to display values, (B, 3, H, W)."""
-    noise = normal_rows(tuple(image.shape[1:]), generators, image.device)
+    noise = random_rows(tuple(image.shape[1:]), generators, image.device, Tensor.normal_)
     read, shot = (v.square()[:, None, None, None] for v in (sensor.read_noise, sensor.shot_noise))
     level = torch.addcmul(read, image, shot).sqrt_()
     return torch.addcmul(image, noise, level).clamp_(0, 1)
