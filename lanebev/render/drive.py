@@ -79,7 +79,8 @@ class Drive:
         if weather not in ("any", "clear"):
             raise ValueError(f"weather: expected 'any' or 'clear', got {weather!r}")
         self.seed, self.speed, self.ideal_sensor = seed, speed, ideal_sensor
-        self.camera = (camera or _default_camera(image_size)).to(dtype=torch.float32)
+        height, width = image_size
+        self.camera = (camera or Camera.from_fov(60.0, width, height)).to(dtype=torch.float32)
         self.times = torch.arange(num_frames, dtype=torch.float64) / fps
         sampler = BatchSampler(1, torch.Generator().manual_seed(seed))
         self.world, first_lane = _sample_drive_world(sampler, weather, kind)
@@ -187,12 +188,6 @@ class Drive:
         seeds = [self.seed * 1_000_003 + index for index in indices]
         size = self.camera.image_size
         return render_scenes(scenes, size, seeds, device=device, rows=rows, ideal_sensor=self.ideal_sensor)
-
-
-def _default_camera(image_size: tuple[int, int]) -> Camera:
-    height, width = image_size
-    focal = 0.5 * width / math.tan(math.radians(30.0))
-    return Camera.from_parameters(focal, focal, 0.5 * (width - 1), 0.5 * (height - 1), width, height)
 
 
 def _sample_drive_world(sampler: BatchSampler, weather: str, kind: str) -> tuple[World, Tensor]:

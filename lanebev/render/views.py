@@ -22,7 +22,7 @@ from lanebev.render.scene.camera.lens import (
     varied_extrinsics,
     varied_intrinsics,
 )
-from lanebev.render.scene.camera.window import WindowConfig, sample_window_scale, window_from_native
+from lanebev.render.scene.camera.window import WindowConfig, window_from_native
 from lanebev.render.scene.sampler import BatchSampler
 from lanebev.render.scene.world import Place, Scene, World, moved_along, sample_world, scene_at
 from lanebev.render.truth import frame_truth
@@ -163,7 +163,7 @@ def _through_window(
     sampler: BatchSampler, config: WindowConfig, size: tuple[int, int], world: World, lens: Lens
 ) -> tuple[World, Lens]:
     """Look through windows: other intrinsics, and blur that is as much larger as the native pixels are."""
-    scale = sample_window_scale(sampler, config)
+    scale = sampler.uniform(*config.scale)
     pitch, yaw = lens.extrinsics[:2]
     horizon = vanishing_point(pitch, yaw, lens.intrinsics, lens.distortion, lens.model)
     matrix = window_from_native(sampler, config, scale, size, horizon)

@@ -275,10 +275,11 @@ def test_a_tunnels_lamp_is_seen_where_it_hangs() -> None:
     rays = View((1, 3), ray_x, ray_y, torch.zeros(4, 1, 3))  # lamp at 10 m; none at 20 m; 3 m aside
     dark, free = torch.zeros(1, 3, 1, 3), torch.full((1, 1, 3), float("inf"))
     course = build_alignment(straight, straight)
-    ceiling = add_ceiling(dark, free, tunnel, place, course, lens, rays)[0, 0, 0]
+    scene = scene_at(world._replace(tunnel=tunnel), place, course, lens)
+    ceiling = add_ceiling(scene, rays, dark, free)[0, 0, 0]
     assert ceiling[0] == pytest.approx(3.0)
     assert ceiling[1:].max() < 0.05
-    blocked = add_ceiling(dark, torch.full((1, 1, 3), 5.0), tunnel, place, course, lens, rays)
+    blocked = add_ceiling(scene, rays, dark, torch.full((1, 1, 3), 5.0))
     assert (blocked == 0).all()
 
 

@@ -12,7 +12,7 @@ from lanebev.render.raster.base.features import Features
 from lanebev.render.raster.base.footprint import Ground, ground_under
 from lanebev.render.raster.base.rays import View, coarse_plane, pixel_rays
 from lanebev.render.raster.base.select import as_float, put, take, take_channels
-from lanebev.render.raster.light.night import add_lights, sprites
+from lanebev.render.raster.light.night import add_lights
 from lanebev.render.raster.light.sky import sky_along
 from lanebev.render.raster.objects.hexahedra import Hexahedra, hexahedra
 from lanebev.render.raster.objects.objects import add_objects
@@ -24,9 +24,6 @@ from lanebev.render.scene.road.alignment import ground_hit, lowest_slopes
 from lanebev.render.scene.world import Scene
 
 _METERED = 40.0  # m of road by which the exposure is set
-
-Effect = Callable[[Scene, View, Tensor, Tensor], Tensor]
-"""Of scenes, rays, radiance (B, 3, H, W) and blocked (B, H, W), to the radiance."""
 
 
 class Prepared(NamedTuple):
@@ -77,8 +74,8 @@ def paint_view(scene: Scene, prepared: Prepared, size: tuple[int, int], features
     add_objects(scene, view, prepared.solids, canvas)
     shape = (len(lowest), *view.size)
     radiance, blocked = canvas.radiance.view(3, *shape).transpose(0, 1), canvas.blocked.view(shape)
-    _change_rows(scene, view, radiance, blocked, features.rows.tunnel, _with_ceiling)
-    _change_rows(scene, view, radiance, blocked, features.rows.night, _with_lights)
+    _change_rows(scene, view, radiance, blocked, features.rows.tunnel, add_ceiling)
+    _change_rows(scene, view, radiance, blocked, features.rows.night, add_lights)
     return Painted(
         radiance=radiance,
         blocked=blocked,
@@ -110,28 +107,20 @@ def _add_ground(
 
 
 def _change_rows(
-    scene: Scene, view: View, radiance: Tensor, blocked: Tensor, rows: list[int], effect: Effect
+    scene: Scene,
+    view: View,
+    radiance: Tensor,
+    blocked: Tensor,
+    rows: list[int],
+    effect: Callable[[Scene, View, Tensor, Tensor], Tensor],
 ) -> None:
-    """Change the radiance of some rows by an effect of their scenes and pixels."""
+    """Change the radiance of some rows by an effect of their scenes, rays, radiance and blocked."""
     if not rows:
         return
     index = torch.tensor(rows).to(radiance.device, non_blocking=True)
     own = view._replace(ray_x=view.ray_x.index_select(0, index), ray_y=view.ray_y.index_select(0, index))
     under, hidden = radiance.index_select(0, index), blocked.index_select(0, index)
     radiance.index_copy_(0, index, effect(take_rows(scene, index), own, under, hidden))
-
-
-def _with_ceiling(scene: Scene, view: View, radiance: Tensor, blocked: Tensor) -> Tensor:
-    """Put the ceilings of tunnels in the place of the sky."""
-    tunnel, lens = scene.world.tunnel, scene.lens
-    return add_ceiling(radiance, blocked, tunnel, scene.place, scene.alignment, lens, view)
-
-
-def _with_lights(scene: Scene, view: View, radiance: Tensor, blocked: Tensor) -> Tensor:
-    """Put in lights of the night, their glare and their mirror images."""
-    lights, lens = scene.world.lights, scene.lens
-    shining = sprites(lights, scene.place, scene.alignment, lens, scene.objects)
-    return add_lights(radiance, blocked, lights, shining, lens, view)
 
 
 def _road_level(scene: Scene, below: Blocks, ground: Ground, lit: Tensor) -> Tensor:

@@ -180,9 +180,7 @@ def sample_world(sampler: BatchSampler, kind: str = "any") -> tuple[World, Tenso
     begin = torch.where((kinds.city & more.chance(0.75)) | kinds.country | kinds.tunnel, math.inf, begin)
     extent = sampler.uniform(6, 30)
     bridge = torch.stack([begin, begin + extent], dim=1)
-    traffic = sample_traffic(
-        sampler, layout, ego_lane, surroundings.opposite, pavement.left, pavement.right, begin, extent
-    )
+    traffic = sample_traffic(sampler, layout, ego_lane, surroundings.opposite, pavement, begin, extent)
     traffic = city_traffic(more, kinds.city, street, layout, pavement, traffic)
     traffic = works_traffic(more, kinds.works, layout, traffic, NUM_PARKED)
     traffic = tunnel_traffic(kinds.tunnel, traffic)

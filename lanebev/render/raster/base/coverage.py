@@ -6,7 +6,7 @@ from torch import Tensor
 PSF = 0.5  # px, standard deviation of the pixel's Gaussian: keeps thin stripes' centroids unbiased
 
 
-def stripe_coverage(distance: Tensor, width: Tensor, footprint: Tensor) -> Tensor:
+def stripe_coverage(distance: Tensor, width: Tensor | float, footprint: Tensor) -> Tensor:
     """Compute the share of a Gaussian pixel that a stripe covers.
 
     Args:
@@ -19,13 +19,13 @@ def stripe_coverage(distance: Tensor, width: Tensor, footprint: Tensor) -> Tenso
     return 0.5 * (torch.erf((distance + half) * scale) - torch.erf((distance - half) * scale))
 
 
-def dash_coverage(along: Tensor, length: Tensor, period: Tensor, footprint: Tensor) -> Tensor:
+def dash_coverage(along: Tensor, length: Tensor | float, period: Tensor, footprint: Tensor) -> Tensor:
     """Compute the share of a pixel that a periodic dash covers, integrated exactly along the road."""
     reach = 0.5 * footprint.clamp(min=1e-3)
 
     def painted_up_to(s: Tensor) -> Tensor:
         whole = (s / period).floor()
-        return whole * length + torch.minimum(s - whole * period, length)
+        return whole * length + (s - whole * period).clamp(max=length)
 
     return (painted_up_to(along + reach) - painted_up_to(along - reach)) / (2 * reach)
 
@@ -36,6 +36,6 @@ def band(position: Tensor, low: Tensor, high: Tensor, reach: Tensor) -> Tensor:
     return ((top - bottom) / reach).clamp(0, 1)
 
 
-def beyond(position: Tensor, edge: Tensor, reach: Tensor) -> Tensor:
+def beyond(position: Tensor, edge: Tensor | float, reach: Tensor) -> Tensor:
     """Compute the share of a pixel that lies beyond an edge."""
     return ((position - edge) / reach + 0.5).clamp(0, 1)

@@ -59,7 +59,7 @@ def pixel_rays(lens: Lens, plane: Tensor, size: tuple[int, int]) -> View:
     right, down, ahead = (m[:, i, 0] * x + (m[:, i, 1] * y + m[:, i, 2]) for i in range(3))
     ahead = ahead.clamp(min=1e-2)
     ray_x, ray_y = right / ahead, down / ahead
-    steps = torch.stack([_gradient(ray, dim) for dim in (2, 1) for ray in (ray_x, ray_y)])
+    steps = torch.cat(torch.gradient(torch.stack([ray_x, ray_y]), dim=(3, 2)))
     return View(size, ray_x.flatten(1), ray_y.flatten(1), steps.flatten(2))
 
 
@@ -81,12 +81,3 @@ def _upsampled(values: Tensor, dim: int) -> Tensor:
     for k, weight in enumerate(weights):
         between = between + values.narrow(dim, k, count).unsqueeze(dim + 1) * weight.view(shape)
     return torch.cat([between.flatten(dim, dim + 1), values.narrow(dim, count + 1, 1)], dim=dim)
-
-
-def _gradient(values: Tensor, dim: int) -> Tensor:
-    """Compute central differences, one-sided at the border."""
-    size = values.shape[dim]
-    inner = (values.narrow(dim, 2, size - 2) - values.narrow(dim, 0, size - 2)) * 0.5
-    first = values.narrow(dim, 1, 1) - values.narrow(dim, 0, 1)
-    last = values.narrow(dim, size - 1, 1) - values.narrow(dim, size - 2, 1)
-    return torch.cat([first, inner, last], dim=dim)

@@ -8,11 +8,10 @@ from torch.nn import functional
 
 from lanebev.render.raster.base.noise import sample_line, smoothstep
 from lanebev.render.raster.base.rays import View
-from lanebev.render.scene.camera.lens import Lens
 from lanebev.render.scene.light.night import NUM_LAMPS, Lights
-from lanebev.render.scene.objects.objects import TRUCK, SceneObjects
-from lanebev.render.scene.road.alignment import Alignment, elevation_at, local_from_road, z_from_arc
-from lanebev.render.scene.world import Place
+from lanebev.render.scene.objects.objects import TRUCK
+from lanebev.render.scene.road.alignment import elevation_at, local_from_road, z_from_arc
+from lanebev.render.scene.world import Scene
 from lanebev.tensors import constant, join_tensors
 
 _GLARE_GRID, _MIRROR_GRID = (8, 8), (4, 2)  # px of the image to one of the coarse pictures
@@ -82,27 +81,28 @@ def night_irradiance(
     return lamps, beam
 
 
-def sprites(lights: Lights, place: Place, alignment: Alignment, lens: Lens, objects: SceneObjects) -> Sprites:
+def _sprites(scene: Scene) -> Sprites:
     """Return all lights that a camera may see."""
-    parts = [_street_lamps(lights, place, alignment, lens), _vehicle_lamps(lights, lens, objects)]
-    parts.append(_town(lights, place))
+    parts = [_street_lamps(scene), _vehicle_lamps(scene), _town(scene.world.lights)]
     return join_tensors(lambda each: torch.cat(each, 1), parts)
 
 
-def _street_lamps(lights: Lights, place: Place, alignment: Alignment, lens: Lens) -> Sprites:
+def _street_lamps(scene: Scene) -> Sprites:
+    lights, place, alignment = scene.world.lights, scene.place, scene.alignment
     index = torch.arange(NUM_LAMPS, device=lights.on.device)
     first = (lights.lamp_phase - place.along) % lights.lamp_period
     arc = (first[:, None] + index * lights.lamp_period[:, None]).repeat(1, 2)
     across = (lights.lamp_across - place.across[:, None]).repeat_interleave(NUM_LAMPS, 1)
     x, z, _ = local_from_road(alignment, z_from_arc(alignment, arc), across)
-    down = lens.extrinsics.height[:, None] - elevation_at(alignment, z) - lights.lamp_height[:, None]
+    down = scene.lens.extrinsics.height[:, None] - elevation_at(alignment, z) - lights.lamp_height[:, None]
     power = lights.lamp.repeat_interleave(NUM_LAMPS, 1)
     shine = (_BRIGHT * (power > 0) * (0.4 + power))[..., None] * lights.lamp_colour[:, None]
     return Sprites(torch.stack([x, down, z], -1), 0 * z + 0.25, shine, 0.6 + 0.4 * power)
 
 
-def _vehicle_lamps(lights: Lights, lens: Lens, objects: SceneObjects) -> Sprites:
+def _vehicle_lamps(scene: Scene) -> Sprites:
     """Return two lamps of every vehicle: red ones of those ahead, white ones of oncoming ones."""
+    objects = scene.objects
     body = objects.shape[..., 0, :]
     sin, cos = objects.heading.sin(), objects.heading.cos()
     coming = cos < 0
@@ -113,39 +113,36 @@ def _vehicle_lamps(lights: Lights, lens: Lens, objects: SceneObjects) -> Sprites
     for side in (-0.8, 0.8):
         aside = side * body[..., 0]
         x, z = objects.x + aside * cos + end * sin, objects.z - aside * sin + end * cos
-        down = lens.extrinsics.height[:, None] - objects.ground - torch.where(coming, 0.68, 0.85)
+        down = scene.lens.extrinsics.height[:, None] - objects.ground - torch.where(coming, 0.68, 0.85)
         points.append(torch.stack([x, down, z], -1))
         tail = 0.25 + 0.6 * objects.braking.float()
-        strength = torch.where(coming, 1.5, tail) * shown * lights.on[:, None]
+        strength = torch.where(coming, 1.5, tail) * shown * scene.world.lights.on[:, None]
         shines.append(_BRIGHT * strength[..., None] * torch.where(coming[..., None], white, red))
     shine = torch.cat(shines, 1)
     glare = torch.where(coming, 1.0, 0.25 + 0.25 * objects.braking.float()).repeat(1, 2)
     return Sprites(torch.cat(points, 1), 0 * glare + 0.08, shine, glare)
 
 
-def _town(lights: Lights, place: Place) -> Sprites:
+def _town(lights: Lights) -> Sprites:
     azimuth, rise = lights.spot_place.unbind(-1)
     point = torch.stack([azimuth * _FAR, -rise * _FAR, torch.full_like(rise, _FAR)], dim=-1)
     shine = _BRIGHT * lights.spot[..., None] * lights.spot_colour
     return Sprites(point, lights.spot_size * _FAR, shine, 0.3 * torch.ones_like(rise))
 
 
-def add_lights(
-    radiance: Tensor, blocked: Tensor, lights: Lights, sprites: Sprites, lens: Lens, view: View
-) -> Tensor:
-    """Put lights, their glare and their mirror images into the radiance.
+def add_lights(scene: Scene, view: View, radiance: Tensor, blocked: Tensor) -> Tensor:
+    """Put lights of the night, their glare and their mirror images into the radiance.
 
     Args:
+        scene: B of them.
+        view: the pixels' rays.
         radiance: (B, 3, H, W) linear.
         blocked: (B, H, W) m, Z of the nearest thing that is not the road.
-        lights: lights of the night.
-        sprites: the lights.
-        lens: the cameras.
-        view: the pixels' rays.
 
     Returns:
         (B, 3, H, W).
     """
+    lights, lens, sprites = scene.world.lights, scene.lens, _sprites(scene)
     size = (radiance.shape[2], radiance.shape[3])
     height, width = size
     z = sprites.point[..., 2]

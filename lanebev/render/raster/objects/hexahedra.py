@@ -37,11 +37,10 @@ def hexahedra(objects: SceneObjects, lens: Lens, size: tuple[int, int]) -> Hexah
         lens: from road directions to pixels.
         size: image (height, width).
     """
-    height = lens.extrinsics.height
-    normal, distance = face_planes(objects, height)
+    normal, distance = face_planes(objects, lens.extrinsics.height)
     real = (objects.shape[..., 7] > objects.shape[..., 6])[..., None]
     distance = distance.where(real, -1.0)  # an object that is not real contains no point
-    return Hexahedra(bounding_boxes(objects, lens, height, size), normal, distance)
+    return Hexahedra(bounding_boxes(objects, lens, size), normal, distance)
 
 
 def face_planes(objects: SceneObjects, height: Tensor) -> tuple[Tensor, Tensor]:
@@ -121,13 +120,12 @@ def entered_face(time: Tensor, enters: Tensor, depth: Tensor) -> Tensor:
     return (as_float(time == depth) * enters * number).amax(0).long() - 1
 
 
-def bounding_boxes(objects: SceneObjects, lens: Lens, height: Tensor, size: tuple[int, int]) -> Tensor:
+def bounding_boxes(objects: SceneObjects, lens: Lens, size: tuple[int, int]) -> Tensor:
     """Compute the pixel bounds of every object.
 
     Args:
         objects: the objects.
         lens: from road directions to pixels.
-        height: (B,) m.
         size: image (height, width).
 
     Returns:
@@ -144,7 +142,7 @@ def bounding_boxes(objects: SceneObjects, lens: Lens, height: Tensor, size: tupl
                 sin, cos = objects.heading.sin(), objects.heading.cos()
                 x = objects.x + sx * wide * cos + end * sin
                 z = objects.z - sx * wide * sin + end * cos
-                down = height[:, None] - objects.ground - level
+                down = lens.extrinsics.height[:, None] - objects.ground - level
                 corners.append(torch.stack([x, down, z], dim=-1))
     points = torch.stack(corners, dim=2)  # (B, M, 8, 3)
     seen = objects.valid & (points[..., 2].amax(-1) > 0.5)

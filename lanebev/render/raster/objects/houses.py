@@ -18,15 +18,11 @@ def _share(position: Tensor, length: Tensor | float, period: Tensor | float, foo
     return inside + (length / period - inside) * coarse
 
 
-def house_front(
-    colour: Tensor, height: Tensor, seed: Tensor, along: Tensor, up: Tensor, footprint: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
+def house_front(wall: Wall, along: Tensor, up: Tensor, footprint: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Compute reflectance, coverage and lit windows of a row of houses.
 
     Args:
-        colour: (B, 3, 1) linear reflectance.
-        height: (B, 1) m.
-        seed: (B, 1) in [0, 1).
+        wall: (B,) of them.
         along: (B, N) m.
         up: (B, N) m above the road.
         footprint: (B, N) m per pixel.
@@ -34,6 +30,7 @@ def house_front(
     Returns:
         (B, 3, N); (B, N) in [0, 1]; (B, N) share of lit glass, the brighter the lighter.
     """
+    colour, height, seed = wall.colour[..., None], wall.height[:, None], wall.seed[:, None]
     wide = 9.0 + 16.0 * seed
     house = (along / wide + 7 * seed).floor()
     row = (seed * 97.0).floor()
@@ -67,6 +64,5 @@ def house_front(
 
 def lit_windows(wall: Wall, along: Tensor, up: Tensor, footprint: Tensor) -> Tensor:
     """Compute the radiance of the windows of walls of houses at night, (B, 3, N)."""
-    height, seed = wall.height[:, None], wall.seed[:, None]
-    _, _, lit = house_front(wall.colour[..., None], height, seed, along, up, footprint)
-    return (0.5 * seed * lit)[:, None] * colour_of(lit, 1.0, 0.8, 0.5)
+    _, _, lit = house_front(wall, along, up, footprint)
+    return (0.5 * wall.seed[:, None] * lit)[:, None] * colour_of(lit, 1.0, 0.8, 0.5)

@@ -4,43 +4,31 @@ import torch
 from torch import Tensor
 
 from lanebev.render.raster.base.rays import View
-from lanebev.render.scene.camera.lens import Lens
-from lanebev.render.scene.places.tunnel import Tunnel
-from lanebev.render.scene.road.alignment import Alignment, road_from_local
-from lanebev.render.scene.world import Place
+from lanebev.render.scene.road.alignment import road_from_local
+from lanebev.render.scene.world import Scene
 
 _NO_CEILING = 900.0  # m; beyond, nothing of it is drawn
 
 
-def add_ceiling(
-    radiance: Tensor,
-    blocked: Tensor,
-    tunnel: Tunnel,
-    place: Place,
-    alignment: Alignment,
-    lens: Lens,
-    view: View,
-) -> Tensor:
-    """Put the ceiling in the place of the sky.
+def add_ceiling(scene: Scene, view: View, radiance: Tensor, blocked: Tensor) -> Tensor:
+    """Put the ceilings of tunnels in the place of the sky.
 
     Args:
+        scene: B of them.
+        view: the pixels' rays.
         radiance: (B, 3, H, W) linear.
         blocked: (B, H, W) m, Z of the nearest thing that is not the road.
-        tunnel: about the road.
-        place: of the cameras.
-        alignment: seen from there.
-        lens: the cameras.
-        view: the pixels' rays.
 
     Returns:
         (B, 3, H, W).
     """
+    tunnel, place, lens = scene.world.tunnel, scene.place, scene.lens
     rise = -view.ray_y
     gap = (tunnel.ceiling - lens.extrinsics.height).clamp(min=0.5)[:, None]
     z = gap / rise.clamp(min=1e-3)
     there = (rise > 1e-3) & (z < _NO_CEILING) & blocked.flatten(1).isinf() & (tunnel.on > 0)[:, None]
     z = z.clamp(max=_NO_CEILING)
-    point = road_from_local(alignment, view.ray_x * z, z)
+    point = road_from_local(scene.alignment, view.ray_x * z, z)
     along = point.along + place.along[:, None]
     there = there & (along < tunnel.exit[:, None])
     across = point.across + place.across[:, None]

@@ -93,8 +93,7 @@ def _slope(wall: Wall, along: Tensor, up: Tensor, footprint: Tensor) -> tuple[Te
 
 def _houses(wall: Wall, along: Tensor, up: Tensor, footprint: Tensor) -> tuple[Tensor, Tensor]:
     """Draw house fronts."""
-    height, seed = wall.height[:, None], wall.seed[:, None]
-    return house_front(wall.colour[..., None], height, seed, along, up, footprint)[:2]
+    return house_front(wall, along, up, footprint)[:2]
 
 
 def _foliage(

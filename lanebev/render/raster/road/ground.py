@@ -14,8 +14,7 @@ from lanebev.render.raster.base.select import lines_of, put, take, take_channels
 from lanebev.render.raster.light.night import headlight_irradiance, night_irradiance
 from lanebev.render.raster.light.shadows import shadows
 from lanebev.render.raster.road.markings import near_marking, paint
-from lanebev.render.raster.road.roadside import add_roadside
-from lanebev.render.raster.road.street import add_street
+from lanebev.render.raster.road.street import city_ground
 from lanebev.render.raster.road.surface import LanePlace, pavement_albedo, place_in_lanes
 from lanebev.render.raster.road.symbols import symbols
 from lanebev.render.raster.road.verge import verge_albedo
@@ -122,10 +121,8 @@ def _plain_surface(
     albedo = surface.albedo
 
     road = make_blocks(paved > 0, row=row, num_rows=batch)
-    part, stain = (
-        Ground(*(take(t, road.place) for t in ground)),
-        take_channels(blotch[:3].flatten(1), road.place),
-    )
+    part = Ground(*(take(t, road.place) for t in ground))
+    stain = take_channels(blotch[:3].flatten(1), road.place)
     layout = take_rows(scene.world.layout, road.row)
     pavement = take_rows(scene.world.pavement, road.row)
     lanes = place_in_lanes(layout, part.across)
@@ -135,12 +132,10 @@ def _plain_surface(
 
     beside = make_blocks(paved < 1, row=row, num_rows=batch)
     part = Ground(*(take(t, beside.place) for t in ground))
-    verge = verge_albedo(
-        take_rows(scene.world.surroundings, beside.row), part, take(blotch[0], beside.place)
-    ).transpose(0, 1)
-    share = take(paved, beside.place)
+    around = take_rows(scene.world.surroundings, beside.row)
+    verge = verge_albedo(around, part, take(blotch[0], beside.place)).transpose(0, 1)
     inner = take_channels(albedo, beside.place)
-    put(albedo, beside.place, verge + (inner - verge) * share)
+    put(albedo, beside.place, verge + (inner - verge) * take(paved, beside.place))
     return surface
 
 
@@ -155,25 +150,16 @@ def _add_kinds(
 ) -> None:
     """Put what only some kinds of road have on their ground; changes the surface."""
     kinds = features.rows
-    for name, rows in (("city", kinds.city), ("works", kinds.works), ("snow", kinds.snow)):
+    for rows, change in ((kinds.city, city_ground), (kinds.works, works_ground), (kinds.snow, snow_ground)):
         index = below.of_rows(rows)
         if not len(index):
             continue
         row = below.row.index_select(0, index)
         part = Ground(*(lines_of(t, index) for t in ground))
         own, painted = (t.view(len(t), *paved.shape) for t in surface)
-        channels, paint_on = own.index_select(1, index), painted[0].index_select(0, index)
-        base = channels.transpose(0, 1)
+        base, paint_on = own.index_select(1, index).transpose(0, 1), painted[0].index_select(0, index)
         road, blotch = lines_of(paved, index), lines_of(stain, index)
-        if name == "city":
-            add_roadside(scene, row, part, road, channels)
-            add_street(scene, row, part, road, channels, paint_on, blotch)
-        elif name == "works":
-            base, paint_on = works_ground(take_rows(scene.world.works, row), part, base, road, paint_on)
-        else:
-            layout, pavement = take_rows(scene.world.layout, row), take_rows(scene.world.pavement, row)
-            winter = take_rows(scene.world.winter, row)
-            base, paint_on = snow_ground(winter, layout, pavement, part, base, road, paint_on, blotch)
+        base, paint_on = change(scene, row, part, base, road, paint_on, blotch)
         own.index_copy_(1, index, base.transpose(0, 1))
         painted[0].index_copy_(0, index, paint_on)
 

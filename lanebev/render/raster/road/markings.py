@@ -76,7 +76,7 @@ def paint(
     if features.studs:
         period = of(layout.stud_period)
         pattern = _stud_pattern(phase, period, of(layout.stud_group), reach_along, grazing)
-        across = stripe_coverage(distance, distance.new_full((), STUD_SIZE), reach_across)
+        across = stripe_coverage(distance, STUD_SIZE, reach_across)
         studs = across * pattern * here * as_float(period > 0)
     colour = torch.stack([of(layout.colour[..., i]) for i in range(3)], dim=1)
     return covered * here, studs, colour

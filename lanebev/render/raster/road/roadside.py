@@ -15,14 +15,14 @@ from lanebev.render.scene.world import Scene
 
 
 def add_roadside(scene: Scene, row: Tensor, ground: Ground, paved: Tensor, albedo: Tensor) -> None:
-    """Put what is beside streets over a plain verge; changes the linear reflectance (3, T, N).
+    """Put what is beside streets over a plain verge; changes their linear reflectance.
 
     Args:
         scene: B of them.
         row: (T,) int64, not decreasing, the scene of each line of points.
         ground: (T, N) points.
         paved: (T, N) share of the pixel on the carriageway.
-        albedo: linear reflectance of the plain road and its verge.
+        albedo: (3, T·N) linear reflectance of the plain road and its verge.
     """
     beside = make_blocks(paved < 1, row=row, num_rows=len(scene.place.along))
     own = beside.row
@@ -33,10 +33,9 @@ def add_roadside(scene: Scene, row: Tensor, ground: Ground, paved: Tensor, albed
         scene.place.across[own],
         scene.lens.extrinsics.height[own],
     )
-    planes = albedo.view(3, -1)
-    under = take_channels(planes, beside.place)
+    under = take_channels(albedo, beside.place)
     share = share * (1 - take(paved, beside.place))
-    put(planes, beside.place, under + (colours.transpose(0, 1) - under) * share)
+    put(albedo, beside.place, under + (colours.transpose(0, 1) - under) * share)
 
 
 def roadside(
@@ -77,7 +76,7 @@ def roadside(
 
         tone = street.colours[:, side, KERB, :, None] * (1 + 0.1 * grain)[:, None]
         tone = _blocks(street, along, reach_along, tone)
-        joints = dash_coverage(along, torch.full_like(along, 0.02), torch.ones_like(along), fine_along)
+        joints = dash_coverage(along, 0.02, torch.ones_like(along), fine_along)
         tone = tone * (1 - 0.45 * joints)[:, None]
         for strip in range(KERB + 1, WALK + 1):
             step = beyond(inner, ends[:, strip - 1, None], fine_across)[:, None]
@@ -86,7 +85,7 @@ def roadside(
             if strip == WALK:
                 next_tone = next_tone * _slabs(street, along, inner, fine_along, fine_across)[:, None]
             tone = tone + (next_tone - tone) * step
-        line = stripe_coverage(inner - ends[:, PATH, None], torch.full_like(inner, 0.1), fine_across)
+        line = stripe_coverage(inner - ends[:, PATH, None], 0.1, fine_across)
         line = line * (street.path_line[:, side] * (street.strips[:, side, PATH] > 0))[:, None]
         tone = tone + (street.paint[..., None] - tone) * line[:, None]
 
@@ -116,9 +115,8 @@ def _blocks(street: Street, along: Tensor, reach: Tensor, tone: Tensor) -> Tenso
 def _slabs(street: Street, along: Tensor, inner: Tensor, reach_along: Tensor, reach_across: Tensor) -> Tensor:
     """Compute the factor of slabs' joints and of their different tones, (B, N)."""
     size = street.slab.clamp(min=0.2)[:, None].expand_as(along)
-    gap = torch.full_like(along, 0.012)
     joint = torch.maximum(
-        dash_coverage(along, gap, size, reach_along), dash_coverage(inner, gap, size, reach_across)
+        dash_coverage(along, 0.012, size, reach_along), dash_coverage(inner, 0.012, size, reach_across)
     )
     tone = 0.12 * (hash01((along / size).floor(), (inner / size).floor(), 4.0) - 0.5)
     factor = 1 - 0.5 * joint + tone * (size / (size + reach_along))

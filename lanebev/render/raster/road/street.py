@@ -9,7 +9,7 @@ from lanebev.render.raster.base.footprint import Ground
 from lanebev.render.raster.base.noise import hash01, sample_grain, smoothstep
 from lanebev.render.raster.base.select import put, take, take_channels
 from lanebev.render.raster.road.glyphs import GLYPH_LENGTH, GLYPH_WIDTH, glyph_coverage
-from lanebev.render.raster.road.roadside import junction_coverage
+from lanebev.render.raster.road.roadside import add_roadside, junction_coverage
 from lanebev.render.raster.road.street_surface import ironwork, strips, strips_between, tracks
 from lanebev.render.raster.road.surface import count_below
 from lanebev.render.rows import take_rows
@@ -19,24 +19,28 @@ from lanebev.render.scene.road.pavement import Pavement
 from lanebev.render.scene.world import Scene
 
 
-def add_street(
-    scene: Scene, row: Tensor, ground: Ground, paved: Tensor, albedo: Tensor, painted: Tensor, blotch: Tensor
-) -> None:
-    """Put what is on streets over plain roads; changes the linear reflectance and the coverage by paint.
+def city_ground(
+    scene: Scene, row: Tensor, ground: Ground, albedo: Tensor, paved: Tensor, painted: Tensor, blotch: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Put what is on streets and beside them over plain roads.
 
     Args:
         scene: B of them.
         row: (T,) int64, not decreasing, the scene of each line of points.
         ground: (T, N) points.
+        albedo: (T, 3, N) linear reflectance of the plain road and of what is beside it.
         paved: (T, N) share of the pixel on the carriageway.
-        albedo: (3, T, N) linear reflectance of the plain road.
         painted: (T, N) share of the pixel under the boundaries' paint.
         blotch: (T, N) slow noise.
+
+    Returns:
+        albedo and painted of the streets.
     """
+    planes = albedo.transpose(0, 1).flatten(1)
+    add_roadside(scene, row, ground, paved, planes)
     road = make_blocks(paved > 0, row=row, num_rows=len(scene.place.along))
     world, place = scene.world, road.place
-    planes = albedo.view(3, -1)
-    base, covered = city_ground(
+    base, covered = _street_ground(
         take_rows(world.street, road.row),
         take_rows(world.layout, road.row),
         take_rows(world.pavement, road.row),
@@ -47,9 +51,10 @@ def add_street(
     )
     put(planes, place, base.transpose(0, 1))
     put(painted.view(1, -1), place, covered[None])
+    return planes.view(3, *paved.shape).transpose(0, 1), painted
 
 
-def city_ground(
+def _street_ground(
     street: Street,
     layout: Layout,
     pavement: Pavement,
@@ -58,55 +63,22 @@ def city_ground(
     painted: Tensor,
     blotch: Tensor,
 ) -> tuple[Tensor, Tensor]:
-    """Put what is on a street over a plain road.
-
-    Args:
-        street: what it has.
-        layout: its boundaries.
-        pavement: its edges.
-        ground: (B, N) points.
-        albedo: (B, 3, N) linear reflectance of the plain road and of what is beside it.
-        painted: (B, N) share of the pixel under the boundaries' paint.
-        blotch: (B, N) slow noise.
-
-    Returns:
-        albedo and painted of the street.
-    """
+    """Put what is on a street over a plain road, (B, N) points; returns albedo and painted."""
     coloured = strips(street, layout, pavement, ground.across, ground.reach_across, albedo)
     albedo = albedo + (coloured - albedo) * (1 - painted)[:, None]
-    lane, inside, _, on_lane = lane_coordinates(layout, ground.across)
+    lane, inside, width, on_lane = lane_coordinates(layout, ground.across)
     dark = ironwork(street, ground, lane, inside) * on_lane * (1 - painted)
     albedo = tracks(street, ground, albedo * (1 - dark)[:, None])
-    marks = street_paint(street, layout, pavement, ground, blotch)
-    albedo = albedo + (street.paint[..., None] - albedo) * marks[:, None]
-    return albedo, torch.maximum(painted, marks)
-
-
-def street_paint(
-    street: Street,
-    layout: Layout,
-    pavement: Pavement,
-    ground: Ground,
-    blotch: Tensor,
-) -> Tensor:
-    """Compute the coverage of a pixel by paint that bounds no lane, (B, N).
-
-    Args:
-        street: what is painted.
-        layout: the lanes.
-        pavement: the carriageway's edges.
-        ground: (B, N) points.
-        blotch: (B, N) slow noise: where the paint is worn.
-    """
-    lane, inside, width, on_lane = lane_coordinates(layout, ground.across)
-    marks = torch.maximum(
+    in_lanes = torch.maximum(
         _glyphs(street, ground, lane, inside, width), _hatching(street, ground, lane, inside, width)
     )
-    marks = torch.maximum(marks * on_lane, _across_the_road(street, layout, pavement, ground))
+    marks = torch.maximum(in_lanes * on_lane, _across_the_road(street, layout, pavement, ground))
     marks = torch.maximum(marks, _bays(street, layout, pavement, ground))
     grain = sample_grain(ground.along / 5.0, ground.across / 2.5) / (1 + ground.reach_along / 0.05)
     worn = smoothstep(-0.6, 0.5, blotch * 0.5 + grain * 0.45 + 0.95 - 1.4 * street.wear[:, None])
-    return marks * worn * street.opacity[:, None]
+    marks = marks * worn * street.opacity[:, None]
+    albedo = albedo + (street.paint[..., None] - albedo) * marks[:, None]
+    return albedo, torch.maximum(painted, marks)
 
 
 def lane_coordinates(layout: Layout, across: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -154,7 +126,7 @@ def _hatching(street: Street, ground: Ground, lane: Tensor, inside: Tensor, widt
     share = torch.where(taper > 0, start * taper, width).minimum(width)
     from_left = inside + 0.5 * width
     stripe = stripe * band(from_left, 0.2 + 0 * share, share - 0.1, reach_across)
-    rim = stripe_coverage(from_left - share, torch.full_like(share, 0.14), reach_across) * (share < width)
+    rim = stripe_coverage(from_left - share, 0.14, reach_across) * (share < width)
     here = start < street.hatch_length[:, None]
     return torch.maximum(stripe, rim) * here * street.hatch.gather(1, lane)
 
@@ -178,18 +150,15 @@ def _across_the_road(street: Street, layout: Layout, pavement: Pavement, ground:
     ahead = along + street.phase[:, None]
     half = torch.full_like(across, 0.5)
     stripes = dash_coverage(across, half, 2 * half, reach_across)
-    zebra = dash_coverage(ahead + 4.4, torch.full_like(along, 3.4), period, reach_along) * stripes
-    thin = torch.full_like(along, 0.14)
-    pair = dash_coverage(ahead + 4.4, thin, period, reach_along) + dash_coverage(
-        ahead + 1.2, thin, period, reach_along
-    )
+    zebra = dash_coverage(ahead + 4.4, 3.4, period, reach_along) * stripes
+    pair = sum(dash_coverage(ahead + shift, 0.14, period, reach_along) for shift in (4.4, 1.2))
     ford = pair * dash_coverage(across, half, 1.5 * half, reach_across)
     walk = torch.where(crossing == ZEBRA, zebra, torch.where(crossing == FORD, ford, 0.0)) * edges
 
     slanted, other = (ahead + across) / 1.4, (ahead - across) / 1.4
     reach = (reach_along + reach_across) / 1.4
-    line, cell = torch.full_like(along, 0.12), torch.ones_like(along)
-    grid = torch.maximum(dash_coverage(slanted, line, cell, reach), dash_coverage(other, line, cell, reach))
+    cell = torch.ones_like(along)
+    grid = torch.maximum(dash_coverage(slanted, 0.12, cell, reach), dash_coverage(other, 0.12, cell, reach))
     grid = grid * junction_coverage(street, along, reach_along) * edges * street.box[:, None]
     return torch.maximum(torch.maximum(stop, walk) * there, grid)
 
@@ -201,10 +170,10 @@ def _bays(street: Street, layout: Layout, pavement: Pavement, ground: Ground) ->
     for side, low, high in strips_between(layout, pavement):
         kind = street.strip[:, side, None]
         bay = street.bay[:, side, None].clamp(min=1.0).expand_as(along)
-        lines = dash_coverage(along + street.phase[:, None], torch.full_like(along, 0.1), bay, reach_along)
+        lines = dash_coverage(along + street.phase[:, None], 0.1, bay, reach_along)
         bays = lines * band(across, low, high, reach_across) * (kind == PARKING)
         outer = high - 0.15 if side else low + 0.15
-        line = stripe_coverage(across - outer, torch.full_like(across, 0.1), reach_across) * (kind == CYCLING)
+        line = stripe_coverage(across - outer, 0.1, reach_across) * (kind == CYCLING)
         middle = 0.5 * (low + high)
         position = (along + street.phase[:, None]) % 45.0
         bicycle = torch.where(kind == CYCLING, BICYCLE, -1).expand_as(along)

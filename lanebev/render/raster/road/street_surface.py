@@ -18,20 +18,14 @@ def tracks(street: Street, ground: Ground, albedo: Tensor) -> Tensor:
     _, along, across, reach_along, reach_across = ground
     aside = across - street.tram_across[:, None]
     on = street.tram[:, None]
-    bed = (
-        (1 - beyond(aside.abs(), torch.full_like(aside, 1.25), reach_across))
-        * street.tram_bed[:, None]
-        * (on > 0)
-    )
+    bed = (1 - beyond(aside.abs(), 1.25, reach_across)) * street.tram_bed[:, None] * (on > 0)
     stones = sample_grain(along / 11.0, across / 11.0) / (1 + reach_along / 0.1)
-    sleeper = dash_coverage(along, torch.full_like(along, 0.26), torch.full_like(along, 0.65), reach_along)
+    sleeper = dash_coverage(along, 0.26, torch.full_like(along, 0.65), reach_along)
     ballast = street.tram_ballast[:, None] * (0.5 * stones - 0.45 * sleeper)
     surface = street.tram_colour[..., None] * (1 + 0.1 * stones + ballast).clamp(min=0.2)[:, None]
     albedo = albedo + (surface - albedo) * bed[:, None]
-    rail = stripe_coverage(aside.abs() - 0.5 * RAIL_GAUGE, torch.full_like(aside, 0.07), reach_across)
-    groove = stripe_coverage(
-        aside.abs() - 0.5 * RAIL_GAUGE + 0.06, torch.full_like(aside, 0.05), reach_across
-    )
+    rail = stripe_coverage(aside.abs() - 0.5 * RAIL_GAUGE, 0.07, reach_across)
+    groove = stripe_coverage(aside.abs() - 0.5 * RAIL_GAUGE + 0.06, 0.05, reach_across)
     albedo = albedo + (0.32 - albedo) * (on * rail)[:, None]
     return albedo * (1 - 0.85 * on * groove)[:, None]
 
@@ -48,7 +42,7 @@ def strips(
 
 def strips_between(layout: Layout, pavement: Pavement) -> list[tuple[int, Tensor, Tensor]]:
     """Return side and limits (B, 1), m, of the strips beside the outer boundaries."""
-    last = layout.across.masked_fill(~layout.exists, 0.0).amax(1, keepdim=True)
+    last = layout.last_across()[:, None]
     return [(0, pavement.left[:, None], -0.15 + 0 * last), (1, last, pavement.right[:, None])]
 
 
@@ -76,8 +70,7 @@ def ironwork(street: Street, ground: Ground, lane: Tensor, inside: Tensor) -> Te
     half = 1.0 + 7.0 * hash01(cell, row, 24.0)
     ahead = along - (cell + 0.5) * 23.0
     edge = 0.25 + 1.1 * hash01(cell, row, 25.0)
-    thin = torch.full_like(along, 0.035)
-    long = stripe_coverage(inside.abs() - edge, thin, reach_across) * (ahead.abs() < half)
-    short = stripe_coverage(ahead.abs() - half, thin, reach_along) * (inside.abs() < edge)
+    long = stripe_coverage(inside.abs() - edge, 0.035, reach_across) * (ahead.abs() < half)
+    short = stripe_coverage(ahead.abs() - half, 0.035, reach_along) * (inside.abs() < edge)
     cuts = torch.maximum(long, short) * (hash01(cell, row, 26.0) < street.cuts[:, None])
     return torch.maximum(covers, 0.75 * cuts)

@@ -152,7 +152,7 @@ def _lines(
         dark = dark + strength * crack * smoothstep(-0.2, 0.8, blotch[1])
     if features.skid:
         distance = inside.abs() - 0.75 - 0.1 * wobble
-        skid = stripe_coverage(distance, across.new_full((), 0.2), ground.reach_across)
+        skid = stripe_coverage(distance, 0.2, ground.reach_across)
         skid = skid * smoothstep(0.9, 1.4, sample_line(along / 400.0 + 0.5))
         dark = dark + pavement.skid[:, None] * skid
     return dark.clamp(0, 0.92)

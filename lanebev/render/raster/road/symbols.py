@@ -51,9 +51,7 @@ def symbols(layout: Layout, ground: Ground, lane: Tensor) -> Tensor:
 
 def _arrow(x: Tensor, y: Tensor, wide: Tensor, far: Tensor) -> Tensor:
     """Draw a stem of 3 m and a head of 1.6 m."""
-    stem = stripe_coverage(x, torch.full_like(x, 0.16), wide) * stripe_coverage(
-        y - 1.5, torch.full_like(x, 3.0), far
-    )
+    stem = stripe_coverage(x, 0.16, wide) * stripe_coverage(y - 1.5, 3.0, far)
     gap = 0.42 * (4.6 - y) / 1.6 - x.abs()
     head = (gap / wide + 0.5).clamp(0, 1) * ((y - 3.0) / far + 0.5).clamp(0, 1)
     return torch.maximum(stem, head)
@@ -61,12 +59,8 @@ def _arrow(x: Tensor, y: Tensor, wide: Tensor, far: Tensor) -> Tensor:
 
 def _turn(x: Tensor, y: Tensor, wide: Tensor, far: Tensor) -> Tensor:
     """Draw a stem that leads to a head pointing right."""
-    stem = stripe_coverage(x + 0.3, torch.full_like(x, 0.16), wide) * stripe_coverage(
-        y - 1.6, torch.full_like(x, 3.2), far
-    )
-    bar = stripe_coverage(x - 0.0, torch.full_like(x, 0.6), wide) * stripe_coverage(
-        y - 3.0, torch.full_like(x, 0.5), far
-    )
+    stem = stripe_coverage(x + 0.3, 0.16, wide) * stripe_coverage(y - 1.6, 3.2, far)
+    bar = stripe_coverage(x, 0.6, wide) * stripe_coverage(y - 3.0, 0.5, far)
     gap = 1.1 * (0.75 - x) / 0.5 - (y - 3.0).abs()
     head = (gap / far + 0.5).clamp(0, 1) * ((x - 0.25) / wide + 0.5).clamp(0, 1)
     return torch.maximum(torch.maximum(stem, bar), head)
@@ -78,13 +72,10 @@ def _word(x: Tensor, y: Tensor, wide: Tensor, far: Tensor, seed: Tensor) -> Tens
     u, v = x / _LETTER[0] - letter, y / _LETTER[1]
     inside = (letter >= -2) & (letter < 2) & (v > 0) & (v < 1)
     pick = hash01(letter, seed, 3.0)
-    left = stripe_coverage((u - 0.2) * _LETTER[0], torch.full_like(x, 0.1), wide) * (pick < 0.85)
-    right = stripe_coverage((u - 0.75) * _LETTER[0], torch.full_like(x, 0.1), wide) * (pick > 0.3)
+    left = stripe_coverage((u - 0.2) * _LETTER[0], 0.1, wide) * (pick < 0.85)
+    right = stripe_coverage((u - 0.75) * _LETTER[0], 0.1, wide) * (pick > 0.3)
     bars = [
-        stripe_coverage((v - height) * _LETTER[1], torch.full_like(x, 0.3), far)
-        * (u > 0.1)
-        * (u < 0.85)
-        * chosen
+        stripe_coverage((v - height) * _LETTER[1], 0.3, far) * (u > 0.1) * (u < 0.85) * chosen
         for height, chosen in ((0.08, pick < 0.6), (0.5, pick > 0.4), (0.92, (pick < 0.3) | (pick > 0.6)))
     ]
     strokes = torch.stack([left, right, *bars]).amax(0)

@@ -6,9 +6,11 @@ from torch import Tensor
 from lanebev.render.raster.base.footprint import Ground
 from lanebev.render.raster.base.noise import CLOUD, SECOND, sample_grain, sample_noise, smoothstep
 from lanebev.render.raster.road.surface import count_below, nearest_slot
+from lanebev.render.rows import take_rows
 from lanebev.render.scene.places.winter import Winter
 from lanebev.render.scene.road.layout import MAX_BOUNDARIES, Layout, presence
 from lanebev.render.scene.road.pavement import Pavement
+from lanebev.render.scene.world import Scene
 
 
 def snow_cover(winter: Winter, layout: Layout, pavement: Pavement, ground: Ground, blotch: Tensor) -> Tensor:
@@ -49,16 +51,11 @@ def snow_cover(winter: Winter, layout: Layout, pavement: Pavement, ground: Groun
 
 
 def snow_ground(
-    winter: Winter,
-    layout: Layout,
-    pavement: Pavement,
-    ground: Ground,
-    albedo: Tensor,
-    paved: Tensor,
-    painted: Tensor,
-    blotch: Tensor,
+    scene: Scene, row: Tensor, ground: Ground, albedo: Tensor, paved: Tensor, painted: Tensor, blotch: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Put snow on the ground; arguments as of :func:`~lanebev.render.raster.road.street.city_ground`."""
+    winter, layout = take_rows(scene.world.winter, row), take_rows(scene.world.layout, row)
+    pavement = take_rows(scene.world.pavement, row)
     cover = snow_cover(winter, layout, pavement, ground, blotch)
     field = winter.on[:, None] * winter.verge[:, None] * (1 - paved)
     cover = torch.maximum(cover * paved, field * (0.85 + 0.15 * blotch).clamp(0, 1))

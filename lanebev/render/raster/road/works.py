@@ -5,21 +5,24 @@ from torch import Tensor
 
 from lanebev.render.raster.base.coverage import dash_coverage, stripe_coverage
 from lanebev.render.raster.base.footprint import Ground
+from lanebev.render.rows import take_rows
 from lanebev.render.scene.places.works import NUM_OLD, Works
+from lanebev.render.scene.world import Scene
 
 
 def works_ground(
-    works: Works, ground: Ground, albedo: Tensor, paved: Tensor, painted: Tensor
+    scene: Scene, row: Tensor, ground: Ground, albedo: Tensor, paved: Tensor, painted: Tensor, _: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Put old lines on the ground; arguments as of :func:`~lanebev.render.raster.road.street.city_ground`."""
-    old, scars = old_lines(works, ground)
+    works = take_rows(scene.world.works, row)
+    old, scars = _old_lines(works, ground)
     old, scars = (part * paved * (1 - painted) for part in (old, scars))
     albedo = albedo * (1 - scars)[:, None]
     albedo = albedo + (works.colour[..., None] - albedo) * old[:, None]
     return albedo, torch.maximum(painted, old)
 
 
-def old_lines(works: Works, ground: Ground) -> tuple[Tensor, Tensor]:
+def _old_lines(works: Works, ground: Ground) -> tuple[Tensor, Tensor]:
     """Compute the coverage by lines that are not valid, and the darkening by removed ones, (B, N) both."""
     _, along, across, reach_along, reach_across = ground
     paint, scars = torch.zeros_like(along), torch.zeros_like(along)

@@ -11,7 +11,8 @@ from torch.nn import functional
 from lanebev.render.raster.base.noise import CLOUD, sample_noise, smoothstep
 from lanebev.render.scene.camera.glass import LETTERS, Glass
 
-_HIGH, _WIDE, _FONTS = 24, 16, (cv2.FONT_HERSHEY_SIMPLEX, cv2.FONT_HERSHEY_DUPLEX)
+_HIGH, _WIDE = 24, 16  # px of a letter
+_SHAKES = 9  # images that a shaken one is the mean of
 
 
 @lru_cache(maxsize=8)
@@ -20,7 +21,7 @@ def _letters(device: torch.device) -> Tensor:
     cells, thick = [], []
     for letter in LETTERS:
         canvas = np.zeros((4 * _HIGH, 4 * _WIDE), np.uint8)
-        cv2.putText(canvas, letter, (6, 4 * _HIGH - 18), _FONTS[0], 2.3, 255, 9, cv2.LINE_AA)
+        cv2.putText(canvas, letter, (6, 4 * _HIGH - 18), cv2.FONT_HERSHEY_SIMPLEX, 2.3, 255, 9, cv2.LINE_AA)
         cells.append(cv2.resize(canvas, (_WIDE, _HIGH), interpolation=cv2.INTER_AREA))
         rim = cv2.dilate(canvas, np.ones((15, 15), np.uint8))
         thick.append(cv2.resize(rim, (_WIDE, _HIGH), interpolation=cv2.INTER_AREA))
@@ -28,34 +29,16 @@ def _letters(device: torch.device) -> Tensor:
     return torch.from_numpy(table).flatten(1).to(device)
 
 
-def stamp(
-    image: Tensor,
-    text: Tensor,
-    place: Tensor,
-    high: Tensor,
-    colour: Tensor,
-    strength: Tensor,
-    outline: Tensor,
-) -> Tensor:
-    """Write a line of text over an image.
-
-    Args:
-        image: (B, 3, H, W) display values.
-        text: (B, T) int64, see :func:`~lanebev.render.scene.camera.glass.sample_text`.
-        place: (B, 2) of its upper left corner, shares of width and height.
-        high: (B,) of a letter, share of the height.
-        colour: (B, 3).
-        strength: (B,) in [0, 1].
-        outline: (B,) in [0, 1], of a dark rim.
-    """
+def _stamped(image: Tensor, glass: Glass) -> Tensor:
+    """Write the recorder's line of text, with a dark rim, over an image (B, 3, H, W) of display values."""
     height, width = image.shape[2:]
     y = torch.arange(height, device=image.device)[None, :, None]
     x = torch.arange(width, device=image.device)[None, None, :]
-    tall = (high * height)[:, None, None].clamp(min=4.0)
+    tall = (glass.stamp_height * height)[:, None, None].clamp(min=4.0)
     wide = tall * _WIDE / _HIGH
-    v = (y - place[:, 1, None, None] * height) / tall
-    u = (x - place[:, 0, None, None] * width) / wide
-    slot = u.floor()
+    v = (y - glass.stamp_place[:, 1, None, None] * height) / tall
+    u = (x - glass.stamp_place[:, 0, None, None] * width) / wide
+    text, slot = glass.text, u.floor()
     inside = (v >= 0) & (v < 1) & (slot >= 0) & (slot < text.shape[1])
     letter = text.gather(1, slot.long().clamp(0, text.shape[1] - 1).expand(-1, height, -1).flatten(1))
     letter = letter.unflatten(1, (height, width))
@@ -63,12 +46,9 @@ def stamp(
     column = ((u - slot) * _WIDE).long().clamp(0, _WIDE - 1)
     at = (letter * _HIGH + row) * _WIDE + column
     table = _letters(image.device)
-    on, rim = ((table[i].take(at) * inside * strength[:, None, None])[:, None] for i in (0, 1))
-    image = image * (1 - rim * outline[:, None, None, None])
-    return image + (colour[..., None, None] - image) * on
-
-
-_SHAKES = 9  # images that a shaken one is the mean of
+    on, rim = ((table[i].take(at) * inside * glass.stamp[:, None, None])[:, None] for i in (0, 1))
+    image = image * (1 - rim * glass.stamp_outline[:, None, None, None])
+    return image + (glass.stamp_colour[..., None, None] - image) * on
 
 
 def behind_glass(image: Tensor, glass: Glass) -> Tensor:
@@ -151,20 +131,11 @@ def recorded(image: Tensor, glass: Glass) -> Tensor:
         x - glass.sticker[:, 1, None, None] * width, 1.6 * (y - glass.sticker[:, 2, None, None] * width)
     )
     on = ((radius - distance).clamp(0, 1) * (radius > 0))[:, None]
-    rim = (distance > 0.8 * radius)[:, None] * 0.85 + (distance <= 0.8 * radius)[:, None] * 0.0
-    colour = glass.sticker_colour[..., None, None] * (1 - (rim > 0.5).float()) + rim
+    on_rim = (distance > 0.8 * radius)[:, None]
+    colour = torch.where(on_rim, 0.85, glass.sticker_colour[..., None, None])
     image = image + (colour - image) * on
     image = image * (1 - frame_cover(glass, (height, width)))[:, None]
-    image = stamp(
-        image,
-        glass.text,
-        glass.stamp_place,
-        glass.stamp_height,
-        glass.stamp_colour,
-        glass.stamp,
-        glass.stamp_outline,
-    )
-    return _coded(image, glass)
+    return _coded(_stamped(image, glass), glass)
 
 
 def _coded(image: Tensor, glass: Glass) -> Tensor:

@@ -42,18 +42,7 @@ def take_image(
         (B, 3, H, W) in [0, 1].
     """
     sensor, device, faulty = scene.world.sensor, painted.radiance.device, features.rows.glass
-
-    def rows_with(mask: Tensor) -> Tensor:
-        return mask.nonzero()[:, 0].to(device, non_blocking=True)
-
-    bonnet = host.world.sensor.bonnet
-    if bool((bonnet > 0).any()):
-        rows = rows_with(bonnet > 0)
-        own, light = take_rows(sensor, rows), take_rows(scene.light, rows)
-        open_air = (1 - 0.95 * scene.world.tunnel.on)[:, None]
-        sky = (scene.world.surroundings.skyline * open_air).index_select(0, rows)
-        tallest = float((bonnet + 0.5 * host.world.sensor.bonnet_tilt.abs()).amax())
-        add_bonnet(painted.radiance, painted.blocked, rows, tallest, own, light, sky)
+    _hide_by_bonnets(painted, scene, host)
     image = expose(painted.radiance, sensor, painted.road_level, features.bloom)
     if ideal:
         return image
@@ -61,7 +50,7 @@ def take_image(
     def change(mask: Tensor, effect: Callable[[Tensor, Tensor], Tensor]) -> None:
         """Change the images of the rows in which a mask holds, by an effect of these images and rows."""
         if bool(mask.any()):
-            rows = rows_with(mask)
+            rows = _rows_with(mask, device)
             image.index_copy_(0, rows, effect(image.index_select(0, rows), rows))
 
     raining = host.world.weather.wet > 0
@@ -80,9 +69,26 @@ def take_image(
         shut = frame_cover(glass, (image.shape[2], image.shape[3])) > 0.5
         seen = painted.blocked.index_select(0, windscreens).masked_fill(shut, 0.0)
         painted.blocked.index_copy_(0, windscreens, seen)
-    squeezed = host.world.sensor.jpeg > 0
-    change(squeezed, lambda part, rows: compress(part, sensor.jpeg.index_select(0, rows)))
+    change(host.world.sensor.jpeg > 0, lambda part, rows: compress(part, sensor.jpeg.index_select(0, rows)))
     return image
+
+
+def _rows_with(mask: Tensor, device: torch.device) -> Tensor:
+    """Return the rows in which a mask (B,) on the host holds, on the device."""
+    return mask.nonzero()[:, 0].to(device, non_blocking=True)
+
+
+def _hide_by_bonnets(painted: Painted, scene: Scene, host: Scene) -> None:
+    """Paint the bonnets of own vehicles; changes ``painted``."""
+    bonnet = host.world.sensor.bonnet
+    if not bool((bonnet > 0).any()):
+        return
+    rows = _rows_with(bonnet > 0, painted.radiance.device)
+    own, light = take_rows(scene.world.sensor, rows), take_rows(scene.light, rows)
+    open_air = (1 - 0.95 * scene.world.tunnel.on)[:, None]
+    sky = (scene.world.surroundings.skyline * open_air).index_select(0, rows)
+    tallest = float((bonnet + 0.5 * host.world.sensor.bonnet_tilt.abs()).amax())
+    add_bonnet(painted.radiance, painted.blocked, rows, tallest, own, light, sky)
 
 
 def _blur(image: Tensor, std: Tensor) -> None:

@@ -24,10 +24,8 @@ def sample_text(sampler: BatchSampler, length: int) -> Tensor:
     blank, first = LETTERS.index(" "), LETTERS.index("K")
     codes = [[{"0": -1.0, "*": -2.0}.get(c, float(LETTERS.find(c))) for c in p] for p in _PATTERNS]
     pattern = sampler.pick_from([tuple(c) for c in codes]).long()[:, :length]
-    digit, letter = (
-        sampler.pick([1.0] * 10, length),
-        first + sampler.pick([1.0] * (len(LETTERS) - first), length),
-    )
+    digit = sampler.pick([1.0] * 10, length)
+    letter = first + sampler.pick([1.0] * (len(LETTERS) - first), length)
     text = torch.where(pattern == -1, digit, torch.where(pattern == -2, letter, pattern))
     return text.where(text >= 0, blank)
 
@@ -95,10 +93,7 @@ def sample_glass(sampler: BatchSampler, camera: Tensor, night: Tensor) -> Glass:
 
     amount = torch.where(night, sampler.uniform(0.0, 1.0) ** 2, 0.35 * sampler.uniform(0.0, 1.0) ** 3)
     amount = amount * torch.maximum(here, night.float()) * sampler.chance(0.6)
-    shake = (
-        torch.stack([sampler.normal(4.0), sampler.normal(3.0), sampler.normal(0.012)], dim=1)
-        * amount[:, None]
-    )
+    shake = torch.stack([sampler.normal(std) for std in (4.0, 3.0, 0.012)], dim=1) * amount[:, None]
     below = sampler.chance(0.6)
     high = sampler.uniform(0.03, 0.075)
     top = torch.where(below, 1.0 - high * sampler.uniform(0.8, 1.6), sampler.uniform(-0.01, 0.03))

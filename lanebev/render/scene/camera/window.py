@@ -39,11 +39,6 @@ class WindowConfig:
             raise ValueError(f"expected stretch, shift >= 0, got {self.stretch} and {self.shift}")
 
 
-def sample_window_scale(sampler: BatchSampler, config: WindowConfig) -> Tensor:
-    """Sample the width of windows as a share of the native image's, (B,)."""
-    return sampler.uniform(*config.scale)
-
-
 def window_from_native(
     sampler: BatchSampler,
     config: WindowConfig,

@@ -15,6 +15,7 @@ from lanebev.render.scene.road.alignment import (
     z_from_arc,
 )
 from lanebev.render.scene.road.layout import Layout
+from lanebev.render.scene.road.pavement import Pavement
 from lanebev.render.scene.sampler import BatchSampler
 
 NUM_VEHICLES, NUM_ONCOMING = 14, 5
@@ -23,12 +24,8 @@ CAR_COLOURS = [
     (0.12, 0.125, 0.13), (0.10, 0.015, 0.015), (0.03, 0.06, 0.16), (0.25, 0.22, 0.17), (0.05, 0.09, 0.06),
 ]  # fmt: skip
 SIGN_COLOURS = [
-    (0.01, 0.16, 0.07),
-    (0.01, 0.16, 0.07),
-    (0.02, 0.10, 0.35),
-    (0.6, 0.42, 0.02),
-    (0.5, 0.5, 0.5),
-]
+    (0.01, 0.16, 0.07), (0.01, 0.16, 0.07), (0.02, 0.10, 0.35), (0.6, 0.42, 0.02), (0.5, 0.5, 0.5),
+]  # fmt: skip
 
 
 class Traffic(NamedTuple):
@@ -95,8 +92,7 @@ def sample_traffic(
     layout: Layout,
     ego_lane: Tensor,
     opposite: Tensor,
-    left: Tensor,
-    right: Tensor,
+    pavement: Pavement,
     bridge_at: Tensor,
     bridge_long: Tensor,
 ) -> Traffic:
@@ -107,23 +103,20 @@ def sample_traffic(
         layout: the boundaries.
         ego_lane: (B,) int64.
         opposite: (B,) m, the opposite carriageway's right edge; -infinite: none.
-        left: (B,) m, the pavement's left edge.
-        right: (B,) m, its right edge.
+        pavement: its edges.
         bridge_at: (B,) m along, where a bridge begins; infinite: none.
         bridge_long: (B,) m, its extent along the road.
     """
     vehicles = _sample_vehicles(sampler, layout, ego_lane, opposite)
-    props = _sample_props(sampler, left, right, bridge_at, bridge_long)
+    props = _sample_props(sampler, pavement.left, pavement.right, bridge_at, bridge_long)
     return Traffic(*(torch.cat(pair, dim=1) for pair in zip(vehicles, props, strict=True)))
 
 
 def _sample_vehicles(sampler: BatchSampler, layout: Layout, ego_lane: Tensor, opposite: Tensor) -> Traffic:
     ahead, count = NUM_VEHICLES, NUM_VEHICLES + NUM_ONCOMING
     lanes = (layout.exists.sum(1) - 1).clamp(min=1)[:, None]
-    start, hop = (
-        sampler.uniform(0, 8, 1).long(),
-        1 + (sampler.uniform(0, 1, ahead) * (lanes - 1).clamp(min=1)).long(),
-    )
+    start = sampler.uniform(0, 8, 1).long()
+    hop = 1 + (sampler.uniform(0, 1, ahead) * (lanes - 1).clamp(min=1)).long()
     lane = (start + hop.cumsum(1)) % lanes
     near = torch.where(sampler.chance(0.3, 1), -2.0, 3.0)
     along = near + 6.5 * torch.exp(0.27 * torch.arange(ahead) + 0.12 * sampler.uniform(0, 1, ahead))

@@ -61,7 +61,7 @@ def country_layout(
 
 def country_pavement(sampler: BatchSampler, country: Tensor, layout: Layout, pavement: Pavement) -> Pavement:
     """Sample old asphalt up to the grass, at times gravel or earth, where country (B,) holds."""
-    last = layout.across.masked_fill(~layout.exists, 0.0).amax(1)
+    last = layout.last_across()
     shoulder = sampler.uniform(0.0, 0.5, 2)
     gravel = sampler.chance(0.2)[:, None]
     base = torch.where(gravel, sampler.pick_from(EARTHS) * sampler.uniform(0.7, 1.4, 1), pavement.base)

@@ -35,7 +35,7 @@ def street_edges(
     gap = torch.where(street.strip == CYCLING, sampler.uniform(1.1, 2.2, 2), plain)
     bay = torch.where(street.bay > 4.0, sampler.uniform(1.9, 2.6, 2), sampler.uniform(4.3, 5.2, 2))
     gap = torch.where(street.strip == PARKING, bay, gap)
-    last = layout.across.masked_fill(~layout.exists, 0.0).amax(1)
+    last = layout.last_across()
     edged = pavement._replace(
         left=-gap[:, 0],
         right=last + gap[:, 1],
@@ -138,7 +138,7 @@ def _sample_parked(
     one_side = NUM_PARKED // 2
     side = torch.arange(NUM_PARKED, device=city.device) // one_side
     turn = torch.arange(NUM_PARKED, device=city.device) % one_side
-    last = layout.across.masked_fill(~layout.exists, 0.0).amax(1)
+    last = layout.last_across()
     strip_middle = torch.stack([0.5 * pavement.left, 0.5 * (last + pavement.right)], 1)
     on_kerb = torch.stack([pavement.left - 0.4, pavement.right + 0.4], 1)
     across = torch.where(street.strip == PARKING, strip_middle, on_kerb)

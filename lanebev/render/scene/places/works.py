@@ -104,7 +104,7 @@ def works_traffic(
     body = torch.stack([half, top, -deep, deep, -deep_top, deep_top, 0 * one, high], -1)
     turn = torch.arange(count, device=works.device)
     spacing = torch.where(style == 2, 2.3, sampler.uniform(4.0, 14.0, 1))
-    last = layout.across.masked_fill(~layout.exists, 0.0).amax(1)
+    last = layout.last_across()
     across = torch.where(sampler.chance(0.6), last + sampler.uniform(0.3, 1.0), -sampler.uniform(0.3, 1.0))
     red = one.new_tensor([0.5, 0.06, 0.02])
     white = one.new_tensor([0.6, 0.6, 0.6])

@@ -12,21 +12,15 @@ from lanebev.render.scene.road.layout import (
     WHITE,
     YELLOW,
     Layout,
+    boundary_places,
     dashes_of_lines,
 )
 from lanebev.render.scene.sampler import BatchSampler
 
 DASHES = [  # (length, period) m in towns
-    (3.0, 9.0),
-    (3.0, 9.0),
-    (3.0, 4.5),
-    (6.0, 12.0),
-    (2.0, 6.0),
-    (4.0, 10.0),
-    (1.5, 4.5),
-    (0.91, 3.66),
+    (3.0, 9.0), (3.0, 9.0), (3.0, 4.5), (6.0, 12.0), (2.0, 6.0), (4.0, 10.0), (1.5, 4.5), (0.91, 3.66),
     (3.05, 12.19),
-]
+]  # fmt: skip
 BLOCKS = [(0.5, 0.7), (0.5, 1.0), (1.0, 2.0), (1.5, 3.0)]  # broad dashes beside cycle and bus lanes
 
 
@@ -56,9 +50,7 @@ def sample_city_layout(sampler: BatchSampler, base: Layout) -> tuple[Layout, Ten
     lane_width = torch.where(sampler.chance(0.3), sampler.uniform(3.0, 3.75), lane_width)
     lane_width = torch.where(sampler.chance(0.15), sampler.uniform(3.5, 3.95), lane_width)
     uneven = sampler.normal(0.2, slots - 1).clamp(-0.5, 0.5) * sampler.chance(0.7, 1)
-    widths = (lane_width[:, None] + uneven).clamp(2.4, 4.3)
-    across = torch.nn.functional.pad(widths.cumsum(1), (1, 0))
-    across = torch.where(exists, across, 1e3 + 10.0 * index)
+    across = boundary_places((lane_width[:, None] + uneven).clamp(2.4, 4.3), exists)
 
     kind = sampler.pick([0.0, 0.12, 0.88, 0, 0, 0], slots)
     kind = torch.where(middle, sampler.pick([0.04, 0.24, 0.42, 0.22, 0, 0.08], slots), kind)

@@ -11,20 +11,9 @@ from lanebev.types import NUM_BOUNDARIES
 MAX_BOUNDARIES = 8  # painted on the road; six of them, about the ego lane, are the labelled ones
 WHITE, YELLOW = (0.80, 0.80, 0.78), (0.72, 0.46, 0.06)
 DASHES = [  # (length, period) m: US, California, Germany twice, UK, France, Japan, China, exits, towns
-    (3.05, 12.19),
-    (3.05, 12.19),
-    (2.13, 7.32),
-    (6.0, 18.0),
-    (6.0, 12.0),
-    (2.0, 9.0),
-    (3.0, 13.0),
-    (8.0, 20.0),
-    (6.0, 15.0),
-    (0.91, 3.66),
-    (3.0, 4.5),
-    (3.0, 9.0),
-    (4.0, 12.0),
-]
+    (3.05, 12.19), (3.05, 12.19), (2.13, 7.32), (6.0, 18.0), (6.0, 12.0), (2.0, 9.0), (3.0, 13.0),
+    (8.0, 20.0), (6.0, 15.0), (0.91, 3.66), (3.0, 4.5), (3.0, 9.0), (4.0, 12.0),
+]  # fmt: skip
 NONE, SOLID, DASHED, DOUBLE, STUDS, SOLID_DASHED = range(6)
 
 
@@ -79,6 +68,10 @@ class Layout(NamedTuple):
     symbol_phase: Tensor
     symbol_opacity: Tensor
 
+    def last_across(self) -> Tensor:
+        """Return the place of the last boundary, (B,) m."""
+        return self.across.masked_fill(~self.exists, 0.0).amax(1)
+
 
 def sample_layout(sampler: BatchSampler, dotted: Tensor, faint: Tensor) -> Layout:
     """Sample a random road.
@@ -93,14 +86,11 @@ def sample_layout(sampler: BatchSampler, dotted: Tensor, faint: Tensor) -> Layou
     many = sampler.pick([0, 0, 0, 0.2, 1, 2, 2, 1, 0.5])
     count = torch.where(dotted, many, few_or_many)  # boundaries
     lane_width = sampler.either(0.6, (3.4, 3.8), (2.7, 4.0))
-    uneven = torch.where(sampler.chance(0.45), 0.09, 0.0)[:, None] * sampler.normal(1.0, slots - 1).clamp(
-        -2, 2
-    )
-    widths = (lane_width[:, None] + uneven).clamp(2.6, 4.2)
-    across = torch.nn.functional.pad(widths.cumsum(1), (1, 0))
+    uneven = torch.where(sampler.chance(0.45), 0.09, 0.0)[:, None]
+    uneven = uneven * sampler.normal(1.0, slots - 1).clamp(-2, 2)
     index = torch.arange(slots)
     exists = index < count[:, None]
-    across = torch.where(exists, across, 1e3 + 10.0 * index)
+    across = boundary_places((lane_width[:, None] + uneven).clamp(2.6, 4.2), exists)
 
     last = (count - 1)[:, None]
     outer = (index == 0) | (index == last)
@@ -114,7 +104,7 @@ def sample_layout(sampler: BatchSampler, dotted: Tensor, faint: Tensor) -> Layou
     width, colour, opacity = _paint(sampler, faint, outer)
 
     stud = kind == STUDS
-    reflectors = sampler.chance(0.35, 1) & (sampler.chance(0.8, slots)) & (kind != NONE)
+    reflectors = sampler.chance(0.35, 1) & sampler.chance(0.8, slots) & (kind != NONE)
     fraction = sampler.uniform(0.0, 1.0)[:, None]
     stud_period = torch.where(stud | reflectors, torch.where(fraction < 0.85, 14.63, 7.32), 0.0)
     stud_group = torch.where(stud, torch.where(fraction < 0.85, 4.6, 7.4), 0.3)
@@ -146,6 +136,12 @@ def sample_layout(sampler: BatchSampler, dotted: Tensor, faint: Tensor) -> Layou
         symbol_phase=sampler.uniform(0, 150),
         symbol_opacity=sampler.uniform(0.5, 1.0),
     )
+
+
+def boundary_places(widths: Tensor, exists: Tensor) -> Tensor:
+    """Return the places (B, K) m of boundaries by lane widths (B, K - 1) m; missing ones lie far away."""
+    across = torch.nn.functional.pad(widths.cumsum(1), (1, 0))
+    return torch.where(exists, across, 1e3 + 10.0 * torch.arange(MAX_BOUNDARIES))
 
 
 def _kinds_of_lines(sampler: BatchSampler, dotted: Tensor, outer: Tensor) -> Tensor:

@@ -99,17 +99,12 @@ def sample_pavement(
         median: (B,) bool, a barrier stands along the left edge, with a bright strip at its foot.
     """
     concrete = torch.where(dotted, sampler.chance(0.75), sampler.chance(0.25)) | bright
-    base, other = (
-        _tone(sampler, concrete, bright),
-        _tone(sampler, sampler.chance(0.4), bright & sampler.chance(0.5)),
-    )
+    base = _tone(sampler, concrete, bright)
+    other = _tone(sampler, sampler.chance(0.4), bright & sampler.chance(0.5))
     same = sampler.chance(0.6)[:, None]
     tone = 1 + sampler.normal(0.06, MAX_BOUNDARIES + 1) * sampler.chance(0.6, 1)
-    width = layout.across.masked_fill(~layout.exists, 0.0).amax(1)
-    narrow, full = (
-        sampler.chance(0.3, 2),
-        sampler.chance(0.4, 2),
-    )  # a full one is as wide as a lane, or nearly
+    width = layout.last_across()
+    narrow, full = sampler.chance(0.3, 2), sampler.chance(0.4, 2)  # full: about as wide as a lane
     shoulder = torch.where(full, sampler.uniform(2.2, 3.7, 2), sampler.uniform(1.0, 4.0, 2))
     shoulder = torch.where(narrow, sampler.uniform(0.2, 1.0, 2), shoulder)
     shoulder[:, 0] = torch.where(median, sampler.uniform(1.5, 3.7), shoulder[:, 0])
