@@ -16,11 +16,19 @@ from torch import Tensor
 from lanebev.camera.files import camera_from_fields, read_camera, write_camera
 from lanebev.camera.parameters import CameraParameters
 from lanebev.geometry.distortion import check_lens, lens_model, max_undistorted_radius
-from lanebev.geometry.lens import check_points, denormalise_points, distort_points, invert_distortion
+from lanebev.geometry.lens import (
+    check_intrinsics,
+    check_points,
+    denormalise_points,
+    distort_points,
+    invert_distortion,
+)
 from lanebev.geometry.road import rays_from_pixels
 from lanebev.numbers import check_number
 from lanebev.tensors import device_of_numbers
 from lanebev.types import check_numbers_known, check_tensor
+
+_ROUNDED = 1e-6  # error of a number that was computed
 
 
 def check_camera(value: object) -> None:
@@ -52,12 +60,10 @@ class Camera:
     remark: str = ""
 
     def __post_init__(self) -> None:
-        check_tensor("intrinsics", self.intrinsics)
+        check_intrinsics(self.intrinsics)
         check_tensor("distortion", self.distortion)
         check_numbers_known("intrinsics", self.intrinsics)
         check_numbers_known("distortion", self.distortion)
-        if self.intrinsics.shape != (3, 3):
-            raise ValueError(f"intrinsics: expected (3, 3), got {tuple(self.intrinsics.shape)}")
         if self.distortion.ndim != 1:
             raise ValueError(f"distortion: expected (D,), got {tuple(self.distortion.shape)}")
         check_lens(self.distortion, self.model)
@@ -70,6 +76,9 @@ class Camera:
             value = getattr(self, name)
             if not bool(value.isfinite().all()):
                 raise ValueError(f"{name}: expected finite numbers, got {value.flatten().tolist()}")
+        x, y, one = self.intrinsics[2].tolist()
+        if max(abs(x), abs(y), abs(one - 1.0)) > _ROUNDED:
+            raise ValueError(f"intrinsics: expected the last row 0 0 1, got {x:g} {y:g} {one:g}")
         fx, fy = float(self.intrinsics[0, 0]), float(self.intrinsics[1, 1])
         if not (fx > 0 and fy > 0):
             raise ValueError(f"intrinsics: expected positive focal lengths, got fx {fx:g}, fy {fy:g}")

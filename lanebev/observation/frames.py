@@ -13,6 +13,8 @@ from lanebev.geometry.precision import common_dtype
 from lanebev.types import check_tensor
 
 _WIDTH_STEP = 64  # px
+_LARGEST = 8.0  # largest value of an image in [0, 1] after changes of contrast; one in [0, 255] has more
+_SMALLEST = -0.75  # likewise; one that was normalised by mean and standard deviation, or to [-1, 1], has less
 
 
 def check_frame(frame: NDArray[np.uint8] | Tensor, image_size: tuple[int, int]) -> Tensor:
@@ -45,8 +47,10 @@ def check_frame(frame: NDArray[np.uint8] | Tensor, image_size: tuple[int, int]) 
             f"frame: expected a tensor (3, {height}, {width}), the camera's size, got {tuple(frame.shape)}; "
             f"{remedy}"
         )
-    if frame.dtype != torch.uint8 and not frame.is_floating_point():
-        raise ValueError(f"frame: expected uint8 or floating point in [0, 1], got {frame.dtype}")
+    if frame.dtype != torch.uint8:
+        if not frame.is_floating_point():
+            raise ValueError(f"frame: expected uint8 or floating point in [0, 1], got {frame.dtype}")
+        check_scale("frame", frame)
     return frame.reshape(3, height, width)
 
 
@@ -72,6 +76,21 @@ def check_images(image: Tensor) -> None:
         raise ValueError(f"image: expected floating point in [0, 1], got {image.dtype}; divide bytes by 255")
     if 0 in image.shape[1:]:  # B may be 0
         raise ValueError(f"image: expected frames with pixels, got {tuple(image.shape)}")
+
+
+def check_scale(name: str, image: Tensor) -> None:
+    """Raise ValueError if a finite image is in [0, 255] or normalised instead of in [0, 1].
+
+    Reading values on another device would wait for it; a compiled program or ``torch.vmap`` cannot read them.
+    """
+    if not (image.numel() and readable(image)):
+        return
+    smallest, largest = map(float, image.detach().nan_to_num(0.0, 0.0, 0.0).aminmax())
+    if largest > _LARGEST:
+        raise ValueError(f"{name}: expected values in [0, 1], got {largest:g}; divide bytes by 255")
+    if smallest < _SMALLEST:
+        remedy = "leave out the normalisation, which the network does itself"
+        raise ValueError(f"{name}: expected values in [0, 1], got {smallest:g}; {remedy}")
 
 
 def black_unless_finite(image: Tensor) -> tuple[Tensor, Tensor]:

@@ -6,13 +6,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from lanebev.batch import readable
+from lanebev.observation.frames import check_scale
 from lanebev.observation.resnet import ResNet18
 from lanebev.tensors import constant
 from lanebev.types import NUM_BOUNDARIES, check_tensor, check_type
-
-_LARGEST = 8.0  # largest value of an image in [0, 1] after changes of contrast; one in [0, 255] has more
-_SMALLEST = -0.75  # likewise; one that was normalised by mean and standard deviation, or to [-1, 1], has less
 
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
@@ -118,7 +115,7 @@ class LaneSegmenter(nn.Module):
             raise ValueError(
                 f"image: expected floating point in [0, 1], got {image.dtype}; divide bytes by 255"
             )
-        _check_scale(image)
+        check_scale("image", image)
         image = image.to(self.head.weight.dtype)
         mean, std = (constant(each, like=image).view(3, 1, 1) for each in (IMAGENET_MEAN, IMAGENET_STD))
         stem, c2, c3, c4, c5 = self.trunk(self._in_order((image - mean) / std))
@@ -149,21 +146,6 @@ class LaneSegmenter(nn.Module):
             return image
         # contiguous(memory_format=...) does not work in torch.vmap
         return image.permute(0, 2, 3, 1).contiguous().permute(0, 3, 1, 2)
-
-
-def _check_scale(image: Tensor) -> None:
-    """Raise ValueError if a finite image is in [0, 255] or normalised instead of in [0, 1].
-
-    Reading values on another device would wait for it; a compiled program or ``torch.vmap`` cannot read them.
-    """
-    if not (image.numel() and readable(image)):
-        return
-    smallest, largest = map(float, image.detach().nan_to_num(0.0, 0.0, 0.0).aminmax())
-    if largest > _LARGEST:
-        raise ValueError(f"image: expected values in [0, 1], got {largest:g}; divide bytes by 255")
-    if smallest < _SMALLEST:
-        remedy = "leave out the normalisation, which the network does itself"
-        raise ValueError(f"image: expected values in [0, 1], got {smallest:g}; {remedy}")
 
 
 class StripMessage(nn.Module):

@@ -103,6 +103,13 @@ def test_an_undecodable_single_image_writes_nothing(data, tmp_path, capsys):
 
 
 @pytest.mark.slow
+def test_a_link_to_itself_is_one_line(data, tmp_path, capsys):
+    (tmp_path / "link").symlink_to("link")
+    for option in ("--camera", "--lanes"):
+        given = {"--camera": data / "camera.yaml", "--lanes": data / "lanes.json", option: tmp_path / "link"}
+        fails(capsys, ["run", data / "images", *sum(given.items(), ())], "link", "oo many", "links")
+
+
 def test_a_run_does_not_replace_what_it_reads(data, drive, tmp_path, capsys):
     out = tmp_path / "out"
     shutil.copytree(drive, out)

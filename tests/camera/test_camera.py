@@ -166,6 +166,22 @@ def test_impossible_cameras_are_refused(arguments, message):
 
 
 @pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda matrix: 2 * matrix, "intrinsics: expected the last row 0 0 1, got 0 0 2"),
+        (lambda matrix: matrix.T, r"intrinsics: expected \[fx s cx; 0 fy cy; 0 0 1\], got its transpose"),
+        (lambda matrix: matrix.half(), "intrinsics: expected float32 or float64, got torch.float16"),
+        (lambda matrix: matrix.long(), "intrinsics: expected floating point, got torch.int64"),
+        (lambda matrix: matrix[None], r"intrinsics: expected \(3, 3\), got \(1, 3, 3\)"),
+    ],
+)
+def test_a_matrix_of_another_form_is_refused(change, message):
+    matrix = Camera.from_parameters(1000, 1000, 640, 360, 1280, 720).intrinsics
+    with pytest.raises(ValueError, match=message):
+        Camera(change(matrix), torch.zeros(0), "pinhole", (720, 1280))
+
+
+@pytest.mark.parametrize(
     ("distortion", "model", "focal"),
     [((-0.28, 0.07, 0.001, -0.001, -0.008), "pinhole", 560.0), ((0.02, -0.01, 0.0, 0.0), "fisheye", 420.0)],
 )

@@ -249,6 +249,11 @@ def test_careless_arguments_are_named():
         session(np.zeros((720, 1280, 3), np.uint8))
     with pytest.raises(TypeError, match=r"frame: expected a NumPy array or a tensor, got list; .* polyl"):
         session([0])
+    line = [np.array([[320.0, 350.0], [320.0, 200.0]])]
+    with pytest.raises(ValueError, match=r"frame: expected values in \[0, 1\], got 255; divide bytes by 255"):
+        session(torch.full((3, 360, 640), 255.0), polylines=line)
+    with pytest.raises(ValueError, match=r"frame: expected values in \[0, 1\], got -1; leave out the norm"):
+        session(torch.full((3, 360, 640), -1.0), polylines=line)
     with pytest.raises(TypeError, match="stamp: expected seconds as a number, got str"):
         session(stamp="12")
     with pytest.raises(TypeError, match=r"camera: expected a lanebev.Camera, got str; see Camera.from_file"):

@@ -116,14 +116,19 @@ def with_images(
 
     Args:
         record: record of the run.
-        images: frames of the run's source, by rising number; some may be missing.
+        images: frames of the run's source, by rising number; some before the last may be missing.
 
     Raises:
-        ValueError: the frames are not the run's: they have other names or times, or there are more of them.
+        ValueError: the frames are not the run's: they have other names or times, or there are more or fewer.
     """
     pictures = iter(() if images is None else images)
     picture = next(pictures, None)
     for frame in record.frames():
+        if picture is None and images is not None:
+            raise ValueError(
+                f"images: expected the {len(record.rows)} frames of the run, got none from number "
+                f"{frame.row.frame + 1} on; is it the run's source?"
+            )
         while picture is not None and picture.number < frame.row.frame:
             picture = next(pictures, None)
         image = None

@@ -30,9 +30,10 @@ def check_inputs_stay(folder: str | Path, inputs: Iterable[str | Path]) -> None:
         folder: output folder.
         inputs: files that the run reads, its state to resume with left out: that one is meant to be renewed.
     """
-    outputs = {Path(os.path.realpath(folder)) / name for name in OUTPUT_NAMES}
+    outputs = {os.path.join(os.path.realpath(folder), name) for name in OUTPUT_NAMES}
     for path in map(Path, inputs):
-        if {path.resolve(), path.parent.resolve() / path.name} & outputs:
+        # Path.resolve raises RuntimeError where a link leads to itself
+        if {os.path.realpath(path), os.path.join(os.path.realpath(path.parent), path.name)} & outputs:
             raise ValueError(
                 f"input {path}: expected a file that the run does not replace, got one of the outputs in "
                 f"{folder}; give another folder with --out"

@@ -12,9 +12,12 @@ def replacement(path: str | Path) -> Iterator[Path]:
     """Give a path to write to, whose file takes the place of ``path`` if the ``with`` block ends well.
 
     Raises:
-        OSError: the file cannot be written; an older one is as it was then.
+        OSError: the file cannot be written, or a folder, a device or a pipe is there; an older file is as it
+            was then.
     """
     path = Path(path)
+    if path.exists() and not path.is_file():  # such as /dev/null
+        raise OSError(0, "a folder" if path.is_dir() else "a device or a pipe")
     with tempfile.TemporaryDirectory(prefix=f".{path.name}.partial-", dir=path.parent) as partial:
         whole = Path(partial) / path.name
         yield whole
@@ -30,8 +33,6 @@ def whole_file(path: str | Path) -> Iterator[Path]:
     """
     target = Path(os.path.realpath(path))
     try:
-        if target.is_dir():
-            raise IsADirectoryError(0, "a folder")
         target.parent.mkdir(parents=True, exist_ok=True)
         with replacement(target) as whole:
             yield whole

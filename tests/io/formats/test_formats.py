@@ -2,6 +2,7 @@
 
 import json
 import math
+import os
 import resource
 from dataclasses import replace
 
@@ -25,6 +26,7 @@ from lanebev.io.frames import Frame
 from lanebev.io.images.pixels import write_png
 from lanebev.io.output.whole_file import whole_file
 from lanebev.io.results import ExtrinsicsRow, poses_of, write_extrinsics
+from lanebev.io.state import save_state
 
 FRAMES = 5
 LENS = (-0.1, 0.02, 0.001, -0.002, 0.003)
@@ -255,6 +257,10 @@ def test_images_that_are_not_the_runs_are_refused(changed, message):
     more = [*_images(), *(frame._replace(number=FRAMES) for frame in list(_images())[:1])]
     with pytest.raises(ValueError, match="images: expected the 5 frames of the run, got number 6 too; is it"):
         list(with_images(RECORD, more))
+    with pytest.raises(
+        ValueError, match=r"the 5 frames of the run, got none from number 4 on; is it the run's"
+    ):
+        list(with_images(RECORD, list(_images())[:2]))
     without_last = [frame for frame in more if frame.number != FRAMES - 1]
     with pytest.raises(ValueError, match="images: expected the 5 frames of the run, got number 6 too; is it"):
         list(with_images(RECORD, without_last))
@@ -317,6 +323,18 @@ def test_rerun_by_its_reader(tmp_path):
     strips = columns["/road/camera/boundaries", "LineStrips2D:strips"]
     assert np.allclose(strips[1][0], LINE + 1.5)
     assert len(columns["/road/camera/image", "EncodedImage:blob"]) == 4
+
+
+def test_a_device_a_pipe_and_a_folder_are_not_replaced(tmp_path):  # /dev/null was, by root
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "folder").mkdir()
+    for name, got in (("pipe", "a device or a pipe"), ("folder", "a folder")):
+        words = rf"{name}: expected a file that can be written, got: {got}; "
+        with pytest.raises(ValueError, match=words), whole_file(tmp_path / name):
+            pass
+        with pytest.raises(OSError, match=got):
+            save_state(tmp_path / name, {})
+    assert (tmp_path / "pipe").is_fifo()
 
 
 @pytest.mark.parametrize("name", FORMATS)
