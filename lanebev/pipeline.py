@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection
+from collections.abc import Collection
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -23,7 +23,7 @@ from lanebev.observation.far_view import FarView
 from lanebev.observation.frames import black_unless_finite, check_images
 from lanebev.observation.lines import LineExtractor
 from lanebev.observation.segments import LaneSegments, segments_from_vertices
-from lanebev.tensors import join_tensors
+from lanebev.tensors import join_tensors, map_tensors
 from lanebev.torch_internals import register_pytree
 from lanebev.types import Calibration, Extrinsics, check_devices
 from lanebev.view.checks import doubt_intrinsics
@@ -240,8 +240,7 @@ class LaneBEV(BoundaryDetector):
             dtype = common_dtype(intrinsics) if state is None else state[0].dtype
             fresh = self.initial_state(batch, dtype, image.device)
             state = fresh if state is None else state
-        observer = self._observe_together if self.far_view is None else self._observe_in_turn
-        observed = observer(frames, cameras, distortion, model)
+        clips = None if self.far_view else self._observe_clips(frames, cameras, distortion, model)
         intervals = per_frame("dt", dt, batch, steps, intrinsics)
         outputs = []
         for step in range(steps):
@@ -249,9 +248,14 @@ class LaneBEV(BoundaryDetector):
                 state = select_rows(begins[:, step], fresh, state)
             if truncation is not None and step % truncation == 0:
                 state = state.detach()
-            logits, segments = observed(step, state)
-            self._check_channels(logits)
             camera = cameras[:, step]
+            if clips is None:  # the state before the frame places the far view
+                lens = (camera, distortion, model)
+                point = expected_vanishing_point(self.calibrator, state, *lens)
+                logits, segments = self.observe(frames[:, step], *lens, vanishing_point=point)
+            else:
+                logits, segments = clips[0][:, step], LaneSegments(*(part[:, step] for part in clips[1]))
+            self._check_channels(logits)
             with self._gradients("calibrator"):
                 calibration, state = self.calibrator(segments, camera, state, intervals[:, step], lane_width)
                 calibration = self._scaled(calibration, state)
@@ -299,33 +303,18 @@ class LaneBEV(BoundaryDetector):
             valid = select_rows(finite, valid, torch.zeros_like(valid))
         return view, valid
 
-    def _observe_together(
+    def _observe_clips(
         self, frames: Tensor, cameras: Tensor, distortion: Tensor | None, model: str
-    ) -> Callable[[int, Any], tuple[Tensor, LaneSegments]]:
-        """Observe T frames (B, T, 3, H, W) as one batch; return what looks up those of a step."""
+    ) -> tuple[Tensor, LaneSegments]:
+        """Observe T frames (B, T, 3, H, W) as one batch, as :meth:`observe`; of tensors (B, T, ...)."""
         batch, steps = frames.shape[:2]
         lens = None if distortion is None else distortion.repeat_interleave(steps, 0)
-        logits, segments = self.observe(frames.flatten(0, 1), cameras.flatten(0, 1), lens, model)
+        seen = self.observe(frames.flatten(0, 1), cameras.flatten(0, 1), lens, model)
 
-        def of_step(part: Tensor, step: int) -> Tensor:
-            return part.reshape(batch, steps, *part.shape[1:])[:, step]
+        def by_clip(part: Tensor) -> Tensor:
+            return part.reshape(batch, steps, *part.shape[1:])
 
-        return lambda step, _: (
-            of_step(logits, step),
-            LaneSegments(*(of_step(part, step) for part in segments)),
-        )
-
-    def _observe_in_turn(
-        self, frames: Tensor, cameras: Tensor, distortion: Tensor | None, model: str
-    ) -> Callable[[int, Any], tuple[Tensor, LaneSegments]]:
-        """Return a function that observes the frames of a step; the state before it places the far view."""
-
-        def look(step: int, state: Any) -> tuple[Tensor, LaneSegments]:
-            lens = (cameras[:, step], distortion, model)
-            point = expected_vanishing_point(self.calibrator, state, *lens)
-            return self.observe(frames[:, step], *lens, vanishing_point=point)
-
-        return look
+        return by_clip(seen[0]), map_tensors(by_clip, seen[1])
 
     def observe(
         self,

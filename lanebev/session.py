@@ -173,7 +173,7 @@ class Session:
         pixels = None if frame is None else self._rgb(frame)
         dt, remarks = self._clock.step(stamp)
         fast = fast_remark(speed or 0.0, "divide it by 3.6")
-        lost = ["no frame was given"] if frame is None and polylines is None else []
+        lost = "no frame was given" if frame is None and polylines is None else ""
         with torch.inference_mode():
             vertices, scale = self._vertices(pixels, polylines)
             _, calibration, reasons, vertical_curvature = self.tracker.drive_frame(vertices, dt, scale, speed)
@@ -192,11 +192,10 @@ class Session:
             extrinsics=calibration.extrinsics,
             std=Extrinsics.unstack(std),
             status=Status(int(calibration.status[0])),
-            reasons=remarks
-            + lost
-            + ([fast] if fast else [])
-            + ([self._lanes.doubt] if self._lanes.doubt else [])
-            + describe_reasons(reasons & ~Reason.TIME if remarks else reasons),
+            reasons=[
+                *filter(None, (*remarks, lost, fast, self._lanes.doubt)),
+                *describe_reasons(reasons & ~Reason.TIME if remarks else reasons),
+            ],
             mount=mounted,
             mount_needs=describe_mount(mounted, self.tracker.mount_estimator.config),
             calibration=calibration,

@@ -115,10 +115,8 @@ class FrameSource:
                 if isinstance(frame, str) or frame.key_frame:
                     damaged, reported = isinstance(frame, str), False
                 elif damaged and not reported:
-                    problem, reported = (
-                        "up to the next key frame, images may show a lost frame's damage",
-                        True,
-                    )
+                    problem = "up to the next key frame, images may show a lost frame's damage"
+                    reported = True
                 if self.selection.takes(index, float(time - first)):
                     try:
                         image = self._right_size(rgb(frame, self.matrix))

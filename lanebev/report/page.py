@@ -141,7 +141,10 @@ def page_data(report: Report, places: Sequence[int], edges: NDArray[np.float64])
         "after": _plain(report.after[places], 3),
         "stills": report.is_stills,
         "pictures": {
-            str(place): {name: data_uri(data) for name, data in pictures.items()}
+            str(place): {
+                name: f"data:image/jpeg;base64,{base64.b64encode(data).decode('ascii')}"
+                for name, data in pictures.items()
+            }
             for place, pictures in report.pictures.items()
         },
     }
@@ -193,11 +196,6 @@ def summary_facts(report: Report) -> dict[str, str]:
         for name, widths in names.items()
         if np.isfinite(widths).sum() > 1
     }
-
-
-def data_uri(jpeg: bytes) -> str:
-    """Return a picture as an address that holds it."""
-    return f"data:image/jpeg;base64,{base64.b64encode(jpeg).decode('ascii')}"
 
 
 def _plots(report: Report, x: NDArray[np.float64]) -> dict[str, Any]:

@@ -1,6 +1,6 @@
 """Interactive plots of a run: the four estimates with ±2 sigma, and lane widths with both poses."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -24,6 +24,9 @@ from lanebev.report.figures import (
 from lanebev.report.overlay import BOUNDARY_COLOURS
 
 _LABELS = ("pitch (°)", "yaw (°)", "roll (°)", "height (m)")
+Style = tuple[str, str]
+"""Colour of a line, and its name in the legend or nothing."""
+
 _LINE, _UNDETERMINED, _TRUTH, _SECOND = "#1f6feb", "#7d8794", "#24292f", "#c2410c"
 
 
@@ -41,30 +44,12 @@ def plot_estimates(
         stills: each image is on its own.
         truth: a row per frame where it is known.
     """
-    value, std = estimates(rows), estimate_stds(rows)
-    states = all_axis_states(rows)
-    known = states != AxisState.UNKNOWN
-    measured = states <= AxisState.UNCERTAIN
-    true = None if truth is None else estimates(truth)
-    figures: list[Any] = []
-    shown = x_range(x)
-    for axis, label in enumerate(_LABELS):
-        plot = new_figure(label, shown, value_limits(value[:, axis], std[:, axis], known[:, axis], axis))
-        undetermined = known[:, axis] & ~measured[:, axis]
-        kinds = {_LINE: (measured[:, axis], "estimate ±2σ"), _UNDETERMINED: (undetermined, "not determined")}
-        _draw_estimate(plot, x, value[:, axis], std[:, axis], kinds, stills)
-        if true is not None:
-            plot.line(x, true[:, axis], color=_TRUTH, line_dash=[5, 3], line_width=1.2, legend_label="truth")
-        finish(plot, axis == len(_LABELS) - 1, "image" if stills else "time (s)", legend=axis == 0)
-        figures.append(plot)
-    return stacked(figures)
+    styles = ((_LINE, "estimate ±2σ"), (_UNDETERMINED, "not determined"))
+    return _plot_runs(x, [rows], [styles], stills, truth)
 
 
 def plot_two(
-    x: NDArray[np.float64],
-    first: Sequence[ExtrinsicsRow],
-    second: Sequence[ExtrinsicsRow],
-    stills: bool = False,
+    x: NDArray[np.float64], first: Sequence[ExtrinsicsRow], second: Sequence[ExtrinsicsRow], stills: bool
 ) -> dict[str, Any]:
     """Return a plot of the estimates of two runs with ±2 sigma, fainter where they are not determined.
 
@@ -74,26 +59,39 @@ def plot_two(
         second: rows of the same frames.
         stills: each image is on its own.
     """
-    names, colours = ("A", "B"), (_LINE, _SECOND)
-    values = np.stack([estimates(first), estimates(second)])
-    stds = np.stack([estimate_stds(first), estimate_stds(second)])
-    states = np.stack([all_axis_states(first), all_axis_states(second)])
+    styles = [((colour, name), (f"{colour}80", "")) for colour, name in ((_LINE, "A"), (_SECOND, "B"))]
+    return _plot_runs(x, [first, second], styles, stills)
+
+
+def _plot_runs(
+    x: NDArray[np.float64],
+    runs: Sequence[Sequence[ExtrinsicsRow]],
+    styles: Sequence[tuple[Style, Style]],
+    stills: bool,
+    truth: Sequence[ExtrinsicsRow] | None = None,
+) -> dict[str, Any]:
+    """Return a plot of the estimates of runs; styles: of each where it is measured, and undetermined."""
+    values, stds = (np.stack([of(rows) for rows in runs]) for of in (estimates, estimate_stds))
+    states = np.stack([all_axis_states(rows) for rows in runs])
     figures: list[Any] = []
     shown = x_range(x)
     for axis, label in enumerate(_LABELS):
         value, std, state = values[..., axis], stds[..., axis], states[..., axis]
         known, measured = state != AxisState.UNKNOWN, state <= AxisState.UNCERTAIN
-        plot = new_figure(label, shown, value_limits(value.ravel(), std.ravel(), known.ravel(), axis))
-        for i, (name, colour) in enumerate(zip(names, colours, strict=True)):
-            kinds = {colour: (measured[i], name), f"{colour}80": (known[i] & ~measured[i], "")}
+        plot = new_figure(label, shown, value_limits(value, std, known, axis))
+        for i, (style, faint) in enumerate(styles):
+            kinds = {style: measured[i], faint: known[i] & ~measured[i]}
             _draw_estimate(plot, x, value[i], std[i], kinds, stills)
+        if truth is not None:
+            true = estimates(truth)[:, axis]
+            plot.line(x, true, color=_TRUTH, line_dash=[5, 3], line_width=1.2, legend_label="truth")
         finish(plot, axis == len(_LABELS) - 1, "image" if stills else "time (s)", legend=axis == 0)
         figures.append(plot)
     return stacked(figures)
 
 
 def plot_differences(
-    x: NDArray[np.float64], change: NDArray[np.float64], sigma: NDArray[np.float64], stills: bool = False
+    x: NDArray[np.float64], change: NDArray[np.float64], sigma: NDArray[np.float64], stills: bool
 ) -> dict[str, Any]:
     """Return a plot of the change from one run to another with ±2 sigma about zero.
 
@@ -144,16 +142,10 @@ def plot_widths(
     for lane in np.flatnonzero(np.isfinite(widths).any(0)).tolist():
         seen = np.isfinite(widths[:, lane])
         source = ColumnDataSource({"x": x[seen], "width": widths[seen, lane]})
-        colour = "#{:02x}{:02x}{:02x}".format(*_dark(BOUNDARY_COLOURS[lane % len(BOUNDARY_COLOURS)]))
-        plot.scatter(
-            "x",
-            "width",
-            source=source,
-            size=4,
-            color=colour,
-            alpha=0.8,
-            legend_label=f"lane {lane}–{lane + 1}",
-        )
+        on_dark = BOUNDARY_COLOURS[lane % len(BOUNDARY_COLOURS)]
+        colour = "#{:02x}{:02x}{:02x}".format(*(round(0.72 * part) for part in on_dark))  # for white paper
+        name = f"lane {lane}–{lane + 1}"
+        plot.scatter("x", "width", source=source, size=4, color=colour, alpha=0.8, legend_label=name)
     plot.add_layout(Span(location=lane_width, dimension="width", line_color=INK, line_dash=[6, 4]))
     plot.add_tools(HoverTool(tooltips=[(xlabel, "@x{0.00}"), ("width", "@width{0.000} m")]))
     finish(plot, True, xlabel, legend=True)
@@ -195,14 +187,13 @@ def _draw_estimate(
     x: NDArray[np.float64],
     value: NDArray[np.float64],
     std: NDArray[np.float64],
-    kinds: Mapping[str, tuple[NDArray[np.bool_], str]],
+    kinds: dict[Style, NDArray[np.bool_]],
     stills: bool,
 ) -> None:
-    """Draw an axis with ±2 sigma, in two colours; kinds: colour to where it holds and its name."""
+    """Draw an axis with ±2 sigma, in two styles; kinds: style to where it holds."""
     low, high = value - 2 * std, value + 2 * std
     finite = np.isfinite(low) & np.isfinite(high)
-    masks = [mask for mask, _ in kinds.values()]
-    for (colour, (own, name)), other in zip(kinds.items(), reversed(masks), strict=True):
+    for ((colour, name), own), other in zip(kinds.items(), reversed(kinds.values()), strict=True):
         mask = finite & (own if stills else _extended(own, other))
         if not mask.any():
             continue
@@ -223,9 +214,3 @@ def _draw_estimate(
                             **label)  # fmt: skip
         tooltips = [("at", "@x{0.00}"), ("value", "@value{0.000} ± @two_sigma{0.000}")]
         plot.add_tools(HoverTool(renderers=[dots], tooltips=tooltips, mode="vline"))
-
-
-def _dark(colour: tuple[int, int, int]) -> tuple[int, int, int]:
-    """Return the colour for white paper."""
-    red, green, blue = (round(0.72 * part) for part in colour)
-    return red, green, blue

@@ -57,8 +57,8 @@ def strips(rows: Sequence[ExtrinsicsRow], stills: bool = False) -> list[Strip]:
     edges = places_on_axis(rows, stills)
     status = np.array([STATUSES.index(row.status) if row.status in STATUSES else 3 for row in rows])
     states = all_axis_states(rows)
-    found = [_strip("status", status, [name.lower() for name in STATUSES], edges, rows)]
-    kinds = [state.name.lower() for state in AxisState]
+    found = [_strip("status", status, [(name.lower(), name.lower()) for name in STATUSES], edges, rows)]
+    kinds = [(state.name.lower(), STATE_WORDS[state]) for state in AxisState]
     return found + [_strip(name, states[:, i], kinds, edges, rows) for i, name in enumerate(AXES)]
 
 
@@ -83,11 +83,19 @@ def ticks(edges: NDArray[np.float64]) -> list[tuple[float, str]]:
 def _strip(
     name: str,
     states: NDArray[np.int64],
-    kinds: Sequence[str],
+    kinds: Sequence[tuple[str, str]],
     edges: NDArray[np.float64],
     rows: Sequence[ExtrinsicsRow],
 ) -> Strip:
-    """Join equal neighbours; of a long drive, each of 600 parts has the worst state in it."""
+    """Join equal neighbours; of a long drive, each of 600 parts has the worst state in it.
+
+    Args:
+        name: name of the strip.
+        states: (F,) places in ``kinds``.
+        kinds: name of each state, and its words.
+        edges: (F+1,) of the frames, see :func:`places_on_axis`.
+        rows: of the frames.
+    """
     begins = np.unique(np.linspace(0, len(states), _MOST + 1).astype(int)[:-1])
     worst = np.maximum.reduceat(states, begins)
     first = np.flatnonzero(np.append(True, np.diff(worst) != 0))
@@ -95,8 +103,7 @@ def _strip(
     per_cent = 100 * (edges - edges[0]) / (edges[-1] - edges[0])
     stretches = []
     for state, start, end in zip(worst[first].tolist(), bounds[:-1], bounds[1:], strict=True):
-        kind = kinds[state]
-        words = STATE_WORDS[AxisState[kind.upper()]] if kind.upper() in AxisState.__members__ else kind
+        kind, words = kinds[state]
         why = ", ".join(_usual_reasons(rows[start:end])) if state else ""
         place = f"{edges[start]:.1f} to {edges[end]:.1f}"
         text = f"{name} {words}, {place}" + (f": {why}" if why else "")

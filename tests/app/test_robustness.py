@@ -158,8 +158,11 @@ def test_a_killed_run_of_other_settings_is_not_taken_up(data, tmp_path):
     config = RunConfig(str(data / "drive.mp4"), str(data / "camera.yaml"), str(tmp_path / "out"))
     camera, source = Camera.from_file(config.camera), open_source(config.source)
 
-    class Looks:
-        remark, workers = "", 1
+    class Looks(NetworkObserver):
+        workers = 1
+
+        def __init__(self):
+            pass
 
         def __call__(self, frame):
             return "looked"

@@ -9,9 +9,9 @@ from typing import cast
 import numpy as np
 
 from lanebev.app.config import RunConfig
-from lanebev.app.continued.recovery import RecoveredObserver, RestoringObserver
+from lanebev.app.continued.recovery import RecoveredObserver
 from lanebev.app.drive.build import make_observer, match_image_size
-from lanebev.app.drive.observers import Observer
+from lanebev.app.drive.observers import NetworkObserver, Observer
 from lanebev.app.drive.shared_network import SharedNetwork
 from lanebev.app.drive.sources import camera_of, make_source, observed_frames
 from lanebev.io.frames import Frame
@@ -57,4 +57,4 @@ def observer_of_parts(paths: Sequence[Path], observer: Observer) -> Observer:
         observer: observer of frames that are in none of them.
     """
     entries = chain.from_iterable(map(whole_tusimple_lines, paths))
-    return RecoveredObserver(entries, cast(RestoringObserver, observer), number_in_source, is_reported=False)
+    return RecoveredObserver(entries, cast(NetworkObserver, observer), number_in_source, is_reported=False)

@@ -5,13 +5,13 @@ import os
 import threading
 from collections.abc import Callable, Iterator
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
-from typing import Protocol, cast
 
 from lanebev import __version__
 from lanebev.app.config import RunConfig
 from lanebev.app.drive.build import input_files
-from lanebev.app.drive.observers import Observation, Observer
+from lanebev.app.drive.observers import NetworkObserver, Observation, Observer
 from lanebev.camera.model import Camera
 from lanebev.io.frame_source import FrameSource
 from lanebev.io.frames import Frame
@@ -21,14 +21,6 @@ from lanebev.io.output.folder import OutputFolder
 
 LANES_FILE = "lanes.json"
 _SETTINGS, _SEEN = ".settings.json", ".seen.json"  # in the temporary folder
-
-
-class RestoringObserver(Observer, Protocol):
-    """An observer that can return its earlier observations."""
-
-    def restored(self, found: FrameLines) -> Observation:
-        """Return the observation of a frame from its entry in lanes.json."""
-        ...
 
 
 def frame_name(frame: Frame, source: FrameSource) -> str:
@@ -55,7 +47,7 @@ class RecoveredObserver:
     def __init__(
         self,
         entries: Iterator[FrameLines],
-        observer: RestoringObserver,
+        observer: NetworkObserver,
         name_of: Callable[[Frame], str],
         is_reported: bool = True,
     ) -> None:
@@ -104,10 +96,10 @@ def recover_run(
     else:
         (out / _SEEN).unlink(missing_ok=True)
     known.write_text(settings, encoding="utf-8")
-    if config.lanes is not None or source.is_live:
+    if source.is_live or not isinstance(observer, NetworkObserver):
         return observer
     entries = whole_tusimple_lines(out / _SEEN) if (out / _SEEN).is_file() else iter(())
-    return _named(entries, observer, source)
+    return RecoveredObserver(entries, observer, partial(frame_name, source=source))
 
 
 def observer_of_second_pass(
@@ -121,17 +113,11 @@ def observer_of_second_pass(
         reusing: result of :func:`recover_run` for it.
         source: the frames.
     """
-    if not isinstance(reusing, RecoveredObserver):
+    if not (isinstance(reusing, RecoveredObserver) and isinstance(observer, NetworkObserver)):
         return observer
     (out / LANES_FILE).replace(out / _SEEN)
-    return _named(whole_tusimple_lines(out / _SEEN), observer, source)
-
-
-def _named(entries: Iterator[FrameLines], observer: Observer, source: FrameSource) -> RecoveredObserver:
-    """Return an observer that takes the entries of lanes.json by their names."""
-    return RecoveredObserver(
-        entries, cast(RestoringObserver, observer), lambda frame: frame_name(frame, source)
-    )
+    entries = whole_tusimple_lines(out / _SEEN)
+    return RecoveredObserver(entries, observer, partial(frame_name, source=source))
 
 
 def fingerprint(config: RunConfig, source: FrameSource, camera: Camera) -> str:

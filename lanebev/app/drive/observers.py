@@ -2,13 +2,14 @@
 
 import re
 from collections.abc import Sequence
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
 
 from lanebev.app.drive.shared_network import SharedNetwork
 from lanebev.camera.model import Camera
+from lanebev.estimation.tracker import Tracker
 from lanebev.io.frame_source import FrameSource
 from lanebev.io.frames import Frame
 from lanebev.io.images.names import in_natural_order
@@ -209,18 +210,6 @@ class NetworkObserver:
         return 2 * self.model.extractor.config.segments
 
 
-class HorizonSource(Protocol):
-    """A tracker with any calibrator, which says where the lanes meet: (1, 2) px as taken, NaN if unknown."""
-
-    def vanishing_point(self) -> Tensor:
-        """Return the point expected in the next frame."""
-        ...
-
-    def vanishing_point_of_still(self, vertices: BoundaryVertices) -> Tensor:
-        """Return the point in a single image with these vertices."""
-        ...
-
-
 class FarViewObserver(NetworkObserver):
     """Finds lanes in the whole images and in far views, which are about the horizon that a tracker expects.
 
@@ -231,7 +220,7 @@ class FarViewObserver(NetworkObserver):
     """
 
     def __init__(
-        self, network: LaneBEV | SharedNetwork, tracker: HorizonSource, camera: Camera, stills: bool
+        self, network: LaneBEV | SharedNetwork, tracker: Tracker[Any], camera: Camera, stills: bool
     ) -> None:
         super().__init__(network, camera)
         self.tracker, self.stills = tracker, stills

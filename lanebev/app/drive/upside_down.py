@@ -7,7 +7,6 @@ from itertools import islice
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from lanebev.app.drive.build import RunTracker
 from lanebev.app.drive.observers import NetworkObserver, Observer
@@ -45,7 +44,8 @@ def upside_down_remark(
         frames = list(islice(replace(source, selection=source.selection._replace(every=every)), _LOOKED_AT))
     except (OSError, ValueError):  # deleted or changed during the run, which is noticed elsewhere
         return ""
-    turned = [frame._replace(image=_turned(frame)) for frame in frames if frame.image is not None]
+    seen = [(frame, frame.image) for frame in frames if frame.image is not None]
+    turned = [frame._replace(image=np.ascontiguousarray(image[::-1, ::-1])) for frame, image in seen]
     shares = [_share_with_pose(observer, tracker, each) for each in (frames, turned)]
     if not shares[0] < _SHARE <= shares[1]:
         return ""
@@ -54,10 +54,6 @@ def upside_down_remark(
         f"{shares[0]:.0%} of these images as they are; if the images are upside down, turn them, for example "
         "by ffmpeg -vf hflip,vflip"
     )
-
-
-def _turned(frame: Frame) -> NDArray[np.uint8] | None:
-    return None if frame.image is None else np.ascontiguousarray(frame.image[::-1, ::-1])
 
 
 def _share_with_pose(observer: Observer, tracker: RunTracker, frames: Sequence[Frame]) -> float:
