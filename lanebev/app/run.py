@@ -23,7 +23,6 @@ from lanebev.app.continued.smoothing import SmoothedPoses, smooth_frames
 from lanebev.app.continued.source_changes import files_of, source_remarks
 from lanebev.app.convert import writer
 from lanebev.app.drive.build import (
-    RunTracker,
     input_files,
     joint_config,
     make_grid,
@@ -31,7 +30,7 @@ from lanebev.app.drive.build import (
     make_tracker,
     match_image_size,
 )
-from lanebev.app.drive.observers import Observation, Observer
+from lanebev.app.drive.observers import Observation, Observer, RunTracker
 from lanebev.app.drive.shared_network import SharedNetwork
 from lanebev.app.drive.sources import camera_of, ended_by_signals, first_image, make_source, observed_frames
 from lanebev.app.drive.upside_down import upside_down_remark

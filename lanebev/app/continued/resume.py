@@ -4,7 +4,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from lanebev.app.config import CALIBRATORS, RunConfig
-from lanebev.app.drive.build import RunTracker, make_tracker
+from lanebev.app.drive.build import make_tracker
+from lanebev.app.drive.observers import RunTracker
 from lanebev.camera.model import Camera
 from lanebev.io.output.folder import OutputFolder
 from lanebev.io.state import lane_width_remark, load_state

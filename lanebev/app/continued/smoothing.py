@@ -9,8 +9,7 @@ import torch
 from numpy.typing import NDArray
 
 from lanebev.app.continued.recovery import LANES_FILE, frame_name
-from lanebev.app.drive.build import RunTracker
-from lanebev.app.drive.observers import Observation
+from lanebev.app.drive.observers import Observation, RunTracker
 from lanebev.app.recording.storage import StoredNumbers
 from lanebev.estimation.joint.config import JointConfig
 from lanebev.estimation.joint.layout import POSE

@@ -10,7 +10,13 @@ from torch import Tensor
 from torch.nn.utils import convert_conv2d_weight_memory_format
 
 from lanebev.app.config import RunConfig
-from lanebev.app.drive.observers import FarViewObserver, LaneFileObserver, NetworkObserver, Observer
+from lanebev.app.drive.observers import (
+    FarViewObserver,
+    LaneFileObserver,
+    NetworkObserver,
+    Observer,
+    RunTracker,
+)
 from lanebev.app.drive.shared_network import SharedNetwork
 from lanebev.camera.choice import camera_file
 from lanebev.camera.model import Camera
@@ -18,10 +24,8 @@ from lanebev.estimation.calibrator import Calibrator, StateT
 from lanebev.estimation.joint.calibrator import JointCalibrator
 from lanebev.estimation.joint.config import HILLY_ROADS, JointConfig
 from lanebev.estimation.joint.frame_prior import prior_of_mount
-from lanebev.estimation.joint.state import JointState
 from lanebev.estimation.tracker import Tracker
 from lanebev.estimation.two_stage.calibrator import TwoStageCalibrator
-from lanebev.estimation.two_stage.state import TwoStageState
 from lanebev.export.runtime import onnx_calibrator, onnx_model
 from lanebev.io.calibration_file import read_mount
 from lanebev.io.frame_source import FrameSource
@@ -31,8 +35,6 @@ from lanebev.io.lanes.size import lanes_of_whole_images
 from lanebev.pipeline import LaneBEV
 from lanebev.tensors import usable_device
 from lanebev.view.grid import BEVGrid
-
-RunTracker = Tracker[JointState] | Tracker[TwoStageState]
 
 _LOOKED_AT = 20  # images of a folder, for one of the camera's size
 

@@ -2,14 +2,16 @@
 
 import re
 from collections.abc import Sequence
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 import torch
 from torch import Tensor
 
 from lanebev.app.drive.shared_network import SharedNetwork
 from lanebev.camera.model import Camera
+from lanebev.estimation.joint.state import JointState
 from lanebev.estimation.tracker import Tracker
+from lanebev.estimation.two_stage.state import TwoStageState
 from lanebev.io.frame_source import FrameSource
 from lanebev.io.frames import Frame
 from lanebev.io.images.names import in_natural_order
@@ -29,6 +31,8 @@ from lanebev.observation.frames import check_frame, network_image
 from lanebev.observation.polylines import VERTICES_PER_LINE, distorted_line, vertices_from_lines
 from lanebev.pipeline import LaneBEV
 from lanebev.tensors import map_tensors
+
+RunTracker = Tracker[JointState] | Tracker[TwoStageState]
 
 _MOST_WORKERS = 4  # each holds a frame's feature maps in memory
 _HIGHEST = 4  # times its width, an image: the network resizes it to a fixed width, and would need many GB
@@ -220,7 +224,7 @@ class FarViewObserver(NetworkObserver):
     """
 
     def __init__(
-        self, network: LaneBEV | SharedNetwork, tracker: Tracker[Any], camera: Camera, stills: bool
+        self, network: LaneBEV | SharedNetwork, tracker: RunTracker, camera: Camera, stills: bool
     ) -> None:
         super().__init__(network, camera)
         self.tracker, self.stills = tracker, stills

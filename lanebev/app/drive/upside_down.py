@@ -8,8 +8,7 @@ from itertools import islice
 import numpy as np
 import torch
 
-from lanebev.app.drive.build import RunTracker
-from lanebev.app.drive.observers import NetworkObserver, Observer
+from lanebev.app.drive.observers import NetworkObserver, Observer, RunTracker
 from lanebev.io.frame_source import FrameSource
 from lanebev.io.frames import Frame
 from lanebev.types import Status
