@@ -16,6 +16,7 @@ from lanebev.camera.parameters import (
     OFF_CENTRE,
     CameraParameters,
     centre_offset,
+    left_square,
     matrix_entries,
     size_of_images,
 )
@@ -98,7 +99,7 @@ def _kitti(entries: Mapping[str, str], name: str, image_size: tuple[int, int] | 
             "expected the image size, got none, and the focal length is none of KITTI's; "
             "add a line 'S_rect_02: WIDTH HEIGHT' with P_rect_02, or use the short YAML"
         )
-    matrix = projection[0:3] + projection[4:7] + projection[8:11]
+    matrix = left_square(projection)
     if size_name not in entries and centre_offset(matrix, size) > OFF_CENTRE:
         raise ValueError(
             f"{name}: expected a camera of the images' {size[1]} x {size[0]} px, got a principal point of "

@@ -5,8 +5,8 @@ from collections.abc import Mapping
 from typing import Any
 
 from lanebev.camera.named_lens import LENS_NAMES, stated_lens
-from lanebev.camera.parameters import CameraParameters, centre_offset, checked, matrix_entries
-from lanebev.camera.parsing import camera_matrix, mapping, number, numbers, whole_number
+from lanebev.camera.parameters import CameraParameters, centre_offset, checked, left_square, matrix_entries
+from lanebev.camera.parsing import camera_matrix, given_keys, mapping, number, numbers, whole_number
 from lanebev.numbers import shown
 
 MATRIX_KEYS = ("camera_matrix", "K", "mtx", "intrinsics", "intrinsic_matrix")
@@ -132,7 +132,7 @@ def opencv_or_ros(
             f"unknown key {shown(unknown[0])}; expected fx, fy, cx, cy, width, height, distortion, model, or "
             f"camera_matrix and distortion_coefficients; {remedy}"
         )
-    if image_size and not any(fields.get(key) is not None for key in (*_WIDTH_KEYS, *_HEIGHT_KEYS)):
+    if image_size and not given_keys(fields, *_WIDTH_KEYS, *_HEIGHT_KEYS):
         return _of_images(fields, rectified, image_size)
     if short:
         return checked(_short(fields, rectified))
@@ -182,17 +182,17 @@ def with_sides(fields: Mapping[str, Any]) -> Mapping[str, Any]:
     """
     fields = {key: _two_sides(value) for key, value in fields.items()}
     lists = (key for key, value in fields.items() if isinstance(value, list | Mapping))
-    given = next((key for key in lists if spelled(key) in _SIDES_KEYS), None)
-    if given is None or any(fields.get(key) is not None for key in (*_WIDTH_KEYS, *_HEIGHT_KEYS)):
+    both = next((key for key in lists if spelled(key) in _SIDES_KEYS), None)
+    if both is None or given_keys(fields, *_WIDTH_KEYS, *_HEIGHT_KEYS):
         return fields
-    rest = {key: value for key, value in fields.items() if key != given}
-    if isinstance(fields[given], Mapping) and "width" in fields[given]:
-        return {**rest, **fields[given]}
-    sides = numbers(fields, given)
+    rest = {key: value for key, value in fields.items() if key != both}
+    if isinstance(fields[both], Mapping) and "width" in fields[both]:
+        return {**rest, **fields[both]}
+    sides = numbers(fields, both)
     if len(sides) == 3:
         sides.remove(min(sides))
     if len(sides) != 2 or min(sides) < _LEAST_SIDE:
-        raise ValueError(f"{given}: expected width and height, got {shown(fields[given])}")
+        raise ValueError(f"{both}: expected width and height, got {shown(fields[both])}")
     if fields.get("cx") is not None:
         matrix = [0.0, 0.0, number(fields, "cx"), 0.0, 0.0, number(fields, "cy")]
     else:
@@ -240,10 +240,9 @@ def without_lens(camera: CameraParameters) -> CameraParameters:
 
 def _projection(fields: Mapping[str, Any]) -> list[float]:
     """Return the left 3 x 3 matrix of P, row by row."""
-    if all(fields.get(key) is None for key in _PROJECTION_KEYS):
+    if not given_keys(fields, *_PROJECTION_KEYS):
         raise ValueError("projection_matrix: expected P for rectified images, got none; add the entry")
-    entries = numbers(fields, *_PROJECTION_KEYS, count=12)
-    return entries[0:3] + entries[4:7] + entries[8:11]
+    return left_square(numbers(fields, *_PROJECTION_KEYS, count=12))
 
 
 def _restates(fields: Mapping[str, Any]) -> bool:
@@ -260,7 +259,7 @@ def stated_model(fields: Mapping[str, Any], usual: str = "pinhole") -> str:
 
     Of the keys after the first, names that are no lens model are ignored: they may be a product's.
     """
-    written = [str(fields[key]).strip().lower() for key in _MODEL_KEYS if fields.get(key) is not None]
+    written = [str(fields[key]).strip().lower() for key in given_keys(fields, *_MODEL_KEYS)]
     names = [_ALSO.get(name, name) for name in (re.sub(r"[\s_-]+", "_", each) for each in written)]
     if names[:1] == ["none"] and any(stated_lens(fields, _LENS_KEYS, "pinhole")):
         raise ValueError("model: expected the lens model of the coefficients, got none; add the entry")

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from lanebev.camera.parsing import number, numbers
+from lanebev.camera.parsing import given_keys, number, numbers
 from lanebev.numbers import shown
 
 LENS_NAMES = {
@@ -23,17 +23,17 @@ def named_lens(fields: Mapping[str, Any], model: str) -> list[float]:
         model: "pinhole" or "fisheye"; another one has no such names.
     """
     names = LENS_NAMES.get(model, ())
-    given = {name: number(fields, name) for name in LENS_NAMES["pinhole"] if fields.get(name) is not None}
-    alone = "k4" in given and "k5" not in given and model == "pinhole"
+    found = {name: number(fields, name) for name in given_keys(fields, *LENS_NAMES["pinhole"])}
+    alone = "k4" in found and "k5" not in found and model == "pinhole"
     unfit = [
-        name for name, value in given.items() if value and (name not in names or (alone and name == "k4"))
+        name for name, value in found.items() if value and (name not in names or (alone and name == "k4"))
     ]
     if unfit:
         raise ValueError(
-            f"{unfit[0]}: expected no such coefficient of a {model} lens, got {given[unfit[0]]:g}; "
+            f"{unfit[0]}: expected no such coefficient of a {model} lens, got {found[unfit[0]]:g}; "
             "is model: fisheye missing, or wrong?"
         )
-    coefficients = [given.get(name, 0.0) for name in names]
+    coefficients = [found.get(name, 0.0) for name in names]
     if model == "pinhole" and not any(coefficients[_USUAL:]):
         return coefficients[:_USUAL]
     return coefficients
@@ -47,14 +47,14 @@ def stated_lens(fields: Mapping[str, Any], keys: Sequence[str], model: str) -> l
         keys: spellings of the list's key.
         model: "pinhole", "fisheye" or "omni".
     """
-    given = [key for key in keys if fields.get(key) is not None]
-    if any(fields.get(name) is not None for name in LENS_NAMES["pinhole"]):
-        if given:
-            raise ValueError(f"expected one of k1, k2, ... and {given[0]}, got both; keep the right one")
+    lists = given_keys(fields, *keys)
+    if given_keys(fields, *LENS_NAMES["pinhole"]):
+        if lists:
+            raise ValueError(f"expected one of k1, k2, ... and {lists[0]}, got both; keep the right one")
         return named_lens(fields, model)
-    below = fields[given[0]] if given else None
+    below = fields[lists[0]] if lists else None
     if not isinstance(below, Mapping) or "k1" not in below:
-        return numbers(fields, *keys) if given else []
+        return numbers(fields, *keys) if lists else []
     if unknown := [key for key in below if key not in LENS_NAMES["pinhole"]]:
-        raise ValueError(f"{given[0]}: expected k1, k2, p1, p2, k3, got the key {shown(unknown[0])}")
+        raise ValueError(f"{lists[0]}: expected k1, k2, p1, p2, k3, got the key {shown(unknown[0])}")
     return named_lens(below, model)

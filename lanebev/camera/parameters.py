@@ -39,6 +39,11 @@ def matrix_entries(fx: float, fy: float, cx: float, cy: float) -> list[float]:
     return [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]
 
 
+def left_square(entries: list[float]) -> list[float]:
+    """Return the left 3 x 3 of the entries, row by row, of a 3 x 4 matrix or a 4 x 4 one."""
+    return entries[0:3] + entries[4:7] + entries[8:11]
+
+
 def centre_offset(matrix: Sequence[float], image_size: tuple[int, int]) -> float:
     """Return how far the principal point is from the centre of an image, in shares of its sides.
 

@@ -9,11 +9,12 @@ import math
 import re
 import xml.etree.ElementTree as ET
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import yaml
 
-from lanebev.camera.parameters import matrix_entries
+from lanebev.camera.parameters import left_square, matrix_entries
 from lanebev.numbers import finite_numbers, shown
 
 _LARGEST_YAML = 1_000_000  # characters; PyYAML reads some 100,000 a second
@@ -102,26 +103,18 @@ class _TextLoader(yaml.SafeLoader):
         return {key.value: self.construct_object(value, deep=deep) for key, value in node.value}
 
 
-def _construct_mapping(loader: _TextLoader, node: yaml.Node) -> dict[Any, Any]:
-    return loader.construct_mapping(node, deep=True)
-
-
-def _construct_text(loader: _TextLoader, node: yaml.ScalarNode) -> str:
-    return str(loader.construct_scalar(node))
-
-
-def _construct_list(loader: _TextLoader, node: yaml.SequenceNode) -> list[Any]:
-    return loader.construct_sequence(node, deep=True)
-
-
 _TextLoader.add_implicit_resolver(
     "tag:yaml.org,2002:null", re.compile(r"^(?:~|null|Null|NULL|)$"), ["~", "n", "N", ""]
 )
 for _tag in ("opencv-matrix", "opencv-nd-matrix"):
-    _TextLoader.add_constructor(f"tag:yaml.org,2002:{_tag}", _construct_mapping)
-_TextLoader.add_constructor("tag:yaml.org,2002:python/tuple", _construct_list)
+    _TextLoader.add_constructor(
+        f"tag:yaml.org,2002:{_tag}", partial(_TextLoader.construct_mapping, deep=True)
+    )
+_TextLoader.add_constructor(
+    "tag:yaml.org,2002:python/tuple", partial(_TextLoader.construct_sequence, deep=True)
+)
 for _tag in ("int", "float", "bool", "timestamp"):
-    _TextLoader.add_constructor(f"tag:yaml.org,2002:{_tag}", _construct_text)
+    _TextLoader.add_constructor(f"tag:yaml.org,2002:{_tag}", partial(_TextLoader.construct_scalar))
 
 
 def _parse_yaml(text: str) -> list[Any]:
@@ -220,17 +213,16 @@ def _xml_value(element: ET.Element) -> Any:
     return once((field.tag, (field.text or "").strip()) for field in element)
 
 
-def required(fields: Mapping[str, Any], keys: Sequence[str]) -> Any:
-    """Return the value of the first of these spellings of a key that is there."""
-    return fields[_given(fields, keys)[0]]
+def given_keys(fields: Mapping[str, Any], *keys: str) -> list[str]:
+    """Return which of these keys have a value."""
+    return [key for key in keys if fields.get(key) is not None]
 
 
-def _given(fields: Mapping[str, Any], keys: Sequence[str]) -> list[str]:
-    """Return which of these spellings of a key are there, at least one."""
-    given = [key for key in keys if fields.get(key) is not None]
-    if not given:
+def required(fields: Mapping[str, Any], *keys: str) -> Any:
+    """Return the value of the first of these spellings of a key that has one."""
+    if not (found := given_keys(fields, *keys)):
         raise ValueError(f"{keys[0]}: expected a value, got none; add the entry")
-    return given
+    return fields[found[0]]
 
 
 def _read_once(
@@ -240,16 +232,17 @@ def _read_once(
 
     Zeros at the end do not make a difference, as of coefficients.
     """
-    given = _given(fields, keys)
-    first, *others = (read(fields[key]) for key in given)
+    required(fields, *keys)
+    found = given_keys(fields, *keys)
+    first, *others = (read(fields[key]) for key in found)
     if any(a != b for other in others for a, b in itertools.zip_longest(first, other, fillvalue=0.0)):
-        raise ValueError(f"expected one of {' and '.join(given)}, got both, which differ; keep the right one")
+        raise ValueError(f"expected one of {' and '.join(found)}, got both, which differ; keep the right one")
     return first
 
 
 def number(fields: Mapping[str, Any], *keys: str, default: float | None = None) -> float:
     """Return the finite number of a key, or the default if the key is not there."""
-    if default is not None and all(fields.get(key) is None for key in keys):
+    if default is not None and not given_keys(fields, *keys):
         return default
     return _read_once(fields, keys, lambda value: finite_numbers(keys[0], [value], 1))[0]
 
@@ -297,7 +290,7 @@ def _unpadded(name: str, entries: list[float]) -> list[float]:
         return matrix_entries(*entries)
     is_padded = len(entries) in (12, 16) and not any(entries[3:12:4])
     if is_padded and entries[12:] in ([], [0.0, 0.0, 0.0, 1.0]):
-        entries = [*entries[0:3], *entries[4:7], *entries[8:11]]
+        entries = left_square(entries)
     return finite_numbers(name, entries, 9)
 
 

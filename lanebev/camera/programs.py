@@ -8,7 +8,7 @@ from typing import Any
 from lanebev.camera.choice import Readers
 from lanebev.camera.named_lens import named_lens
 from lanebev.camera.parameters import CameraParameters, matrix_entries
-from lanebev.camera.parsing import mapping, number, numbers, required, stated_size, whole_number
+from lanebev.camera.parsing import given_keys, mapping, number, numbers, required, stated_size, whole_number
 from lanebev.numbers import shown
 
 _GYROFLOW_MODELS = {"": "fisheye", "opencv_fisheye": "fisheye", "opencv_standard": "pinhole"}
@@ -50,7 +50,7 @@ def gyroflow(fields: Mapping[str, Any]) -> CameraParameters:
         got = shown(fields.get("digital_lens") or name)
         raise ValueError(f"distortion_model: expected opencv_fisheye or opencv_standard, got {got}")
     lens = mapping("fisheye_params", fields["fisheye_params"])
-    size = mapping("calib_dimension", required(fields, ["calib_dimension"]))
+    size = mapping("calib_dimension", required(fields, "calib_dimension"))
     matrix, distortion = numbers(lens, "camera_matrix", count=9), numbers(lens, "distortion_coeffs")
     return CameraParameters(matrix, distortion, _GYROFLOW_MODELS[name], stated_size(size, "h", "w"))
 
@@ -115,7 +115,7 @@ def metashape(fields: Mapping[str, Any]) -> CameraParameters:
     image, the centre of the first pixel is at (0.5, 0.5), and P1 and P2 are OpenCV's p2 and p1.
     """
     name = str(fields["projection"]).strip().lower()
-    unfit = [key for key in ("k4", "p3", "p4") if fields.get(key) is not None and number(fields, key)]
+    unfit = [key for key in given_keys(fields, "k4", "p3", "p4") if number(fields, key)]
     if name != "frame" or unfit:
         got = unfit[0] if unfit else shown(name)
         raise ValueError(f"projection: expected frame with k1 k2 k3 p1 p2, got {got}; export it as OpenCV's")

@@ -67,8 +67,8 @@ def openmvg_cameras(content: Any) -> Readers:
 
 
 def _openmvg(entry: Mapping[str, Any]) -> CameraParameters:
-    value = mapping("value", required(entry, ["value"]))
-    fields = mapping("data", mapping("ptr_wrapper", required(value, ["ptr_wrapper"])).get("data"))
+    value = mapping("value", required(entry, "value"))
+    fields = mapping("data", mapping("ptr_wrapper", required(value, "ptr_wrapper")).get("data"))
     fields = {**fields, **mapping("value0", fields.get("value0") or {})}
     size = stated_size(fields)
     focal, (cx, cy) = number(fields, "focal_length"), numbers(fields, "principal_point", count=2)

@@ -20,7 +20,7 @@ from lanebev.camera.parameters import (
     matrix_entries,
     size_of_images,
 )
-from lanebev.camera.parsing import camera_matrix, listed_size, number, whole_number
+from lanebev.camera.parsing import camera_matrix, given_keys, listed_size, number, whole_number
 from lanebev.numbers import shown
 
 Record = Mapping[str, Any]
@@ -150,7 +150,7 @@ def _size(
     with suppress(ValueError):  # of a list that is no size, such as that of a map
         record = with_sides({**record, "cx": matrix[2], "cy": matrix[5]})
     sides = (("height", "image_height"), ("width", "image_width"))
-    if all(any(record.get(key) is not None for key in keys) for keys in sides):
+    if all(given_keys(record, *keys) for keys in sides):
         return whole_number(record, *sides[0]), whole_number(record, *sides[1])
     offset = centre_offset(matrix, layout.images)
     if image_size is not None and 2 * centre_offset(matrix, image_size) < offset:

@@ -65,11 +65,11 @@ def as_kalibr(fields: Mapping[str, Any]) -> Mapping[str, Any]:
 
 
 def _of_basalt(camera: Any, size: Any) -> Mapping[str, Any]:
-    name = str(required(mapping("intrinsics", camera), ["camera_type"]))
+    name = str(required(mapping("intrinsics", camera), "camera_type"))
     if name not in _BASALT_MODELS:
         raise ValueError(f"camera_type: expected one of {', '.join(_BASALT_MODELS)}, got {shown(name)}")
     *models, intrinsics, distortion = _BASALT_MODELS[name]
-    values = mapping("intrinsics", required(camera, ["intrinsics"]))
+    values = mapping("intrinsics", required(camera, "intrinsics"))
     return {
         "camera_model": models[0],
         "distortion_model": models[1],
@@ -80,12 +80,12 @@ def _of_basalt(camera: Any, size: Any) -> Mapping[str, Any]:
 
 
 def _of_maplab(entry: Mapping[str, Any]) -> Mapping[str, Any]:
-    camera = mapping("camera", required(entry, ["camera"]))
+    camera = mapping("camera", required(entry, "camera"))
     lens = mapping("distortion", camera.get("distortion") or {})
     return {
-        "camera_model": required(camera, ["type"]),
+        "camera_model": required(camera, "type"),
         "distortion_model": lens.get("type"),
-        "intrinsics": required(camera, ["intrinsics"]),
+        "intrinsics": required(camera, "intrinsics"),
         "distortion_coeffs": lens.get("parameters"),
         "resolution": [whole_number(camera, "image_width"), whole_number(camera, "image_height")],
     }
@@ -119,7 +119,7 @@ def _kalibr(fields: Mapping[str, Any]) -> CameraParameters:
     Source: Kalibr, wiki, "Supported models" and "Yaml formats".
     """
     names = (
-        str(required(fields, ["camera_model"])).strip().lower(),
+        str(required(fields, "camera_model")).strip().lower(),
         str(fields.get("distortion_model") or "none").strip().lower(),
     )
     if names in _KALIBR_RADIAL:
@@ -160,18 +160,18 @@ def _radial(
 
 def camodocal(fields: Mapping[str, Any]) -> CameraParameters:
     """Read CamOdoCal's YAML, which VINS and KITTI-360's fisheyes use: PINHOLE, KANNALA_BRANDT or MEI."""
-    name = str(required(fields, ["model_type"])).strip().upper()
-    projection = mapping("projection_parameters", required(fields, ["projection_parameters"]))
+    name = str(required(fields, "model_type")).strip().upper()
+    projection = mapping("projection_parameters", required(fields, "projection_parameters"))
     size = stated_size(fields, "image_height", "image_width")
     if name == "KANNALA_BRANDT":
         fx, fy, cx, cy = (number(projection, key) for key in ("mu", "mv", "u0", "v0"))
         model, distortion = "fisheye", [number(projection, key) for key in ("k2", "k3", "k4", "k5")]
     elif name in ("PINHOLE", "MEI"):
-        distorted = mapping("distortion_parameters", required(fields, ["distortion_parameters"]))
+        distorted = mapping("distortion_parameters", required(fields, "distortion_parameters"))
         model, distortion = "pinhole", [number(distorted, key) for key in ("k1", "k2", "p1", "p2")]
         keys = ("fx", "fy", "cx", "cy")
         if name == "MEI":
-            mirror = mapping("mirror_parameters", required(fields, ["mirror_parameters"]))
+            mirror = mapping("mirror_parameters", required(fields, "mirror_parameters"))
             model, distortion = "omni", [number(mirror, "xi"), *distortion]
             keys = ("gamma1", "gamma2", "u0", "v0")
         fx, fy, cx, cy = (number(projection, key) for key in keys)
