@@ -47,7 +47,7 @@ from lanebev.io.formats.record import RecordedFrame, vertex_lines
 from lanebev.io.formats.rerun import open_viewer
 from lanebev.io.frame_source import FrameSource
 from lanebev.io.frames import Frame
-from lanebev.io.output.folder import OutputFolder, check_inputs_stay
+from lanebev.io.output.folder import OutputFolder, check_inputs_stay, check_new_or_of_run
 from lanebev.io.results import ExtrinsicsRow
 from lanebev.io.state import save_state
 from lanebev.report.page import Report
@@ -88,6 +88,7 @@ def run(
     config, source = open_for_run(config)
     files = files_of(source)
     check_inputs_stay(config.out, input_files(config, source))
+    check_new_or_of_run(config.out)
     camera = camera_of(config, source)
     source = match_image_size(camera, source)
     logger.info("%s: %d frames of %d x %d", source.source, source.count, *reversed(camera.image_size))

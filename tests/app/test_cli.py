@@ -139,6 +139,19 @@ def test_a_run_does_not_replace_what_it_reads(data, drive, tmp_path, capsys):
     assert (out / "images").is_dir()
 
 
+def test_files_that_no_run_wrote_are_not_replaced_or_removed(data, drive, tmp_path, capsys):
+    out, state = tmp_path / "out", "state.safetensors"
+    out.mkdir()
+    for name in ("lanes.json", "calibration.yaml", "run.mcap"):
+        (out / name).write_text("mine")
+        given = ["run", data / "images", "--camera", data / "camera.yaml", "--lanes", data / "lanes.json"]
+        fails(capsys, [*given, "--out", out], "out: expected a new one or an earlier run's, got one with a f")
+        assert (out / name).read_text() == "mine"
+        (out / name).unlink()
+    shutil.copy(drive / state, out)
+    assert run(data, "--resume", str(out), out=out, source="drive.mp4", lanes="video_lanes.json") == 0
+
+
 def test_an_unwritable_folder_is_one_line(data, tmp_path, capsys):
     (tmp_path / "file").write_text("not a folder")
     for out in (tmp_path / "file", tmp_path / "file" / "out"):

@@ -14,9 +14,10 @@ from lanebev.io.formats.names import FORMATS
 from lanebev.io.output.lock import LOCK_NAME, FolderLock
 from lanebev.signals import handlers_kept
 
+_OF_RUNS = ("extrinsics.csv", "state.safetensors")  # one of them is in a folder of a run
 _OWN_NAMES = (
-    "extrinsics.csv", "filtered.csv", "lanes.json", "bev.mp4", "bev.png", "overlay.mp4", "overlay.png",
-    "report.html", "state.safetensors", "calibration.yaml", "covariance.csv",
+    *_OF_RUNS, "filtered.csv", "lanes.json", "bev.mp4", "bev.png", "overlay.mp4", "overlay.png",
+    "report.html", "calibration.yaml", "covariance.csv",
 )  # fmt: skip
 OUTPUT_NAMES = (*_OWN_NAMES, *(known.file for known in FORMATS.values()))
 
@@ -38,6 +39,16 @@ def check_inputs_stay(folder: str | Path, inputs: Iterable[str | Path]) -> None:
                 f"input {path}: expected a file that the run does not replace, got one of the outputs in "
                 f"{folder}; give another folder with --out"
             )
+
+
+def check_new_or_of_run(folder: str | Path) -> None:
+    """Raise if a folder has files with names of outputs, which a run replaces or removes, but is no run's."""
+    found = next((name for name in OUTPUT_NAMES if os.path.lexists(Path(folder) / name)), None)
+    if found is not None and found not in _OF_RUNS:
+        raise ValueError(
+            f"output folder {folder}: expected a new one or an earlier run's, got one with a file {found} "
+            f"and no {_OF_RUNS[0]}; give another with --out, or move that file"
+        )
 
 
 def check_result(path: str | Path, runs: Iterable[str | Path], inputs: Iterable[str | Path] = ()) -> None:
