@@ -11,29 +11,15 @@ import yaml
 from lanebev import Camera, Extrinsics
 from lanebev.estimation.mount import MountCalibration, MountReason, MountStatus
 from lanebev.io.calibration_file import read_mount, vehicle_from_camera, write_calibration
+from tests.camera.files import assert_same, read, written
 
 DISTORTION = [-0.25, 0.04, -0.0007, 0.0001, -0.115]
 SHORT = {"fx": 1150.0, "fy": 1148.0, "cx": 650.0, "cy": 370.0, "width": 1280, "height": 720}
 LENS = Camera.from_parameters(**SHORT, distortion=DISTORTION)
 
 
-def _write(path, text):
-    path.write_text(text)
-    return path
-
-
-def _assert_same(camera, expected):
-    torch.testing.assert_close(camera.intrinsics, expected.intrinsics, rtol=0, atol=0)
-    torch.testing.assert_close(camera.distortion, expected.distortion, rtol=0, atol=0)
-    assert camera.model == expected.model
-    assert camera.image_size == expected.image_size
-
-
 def test_short_yaml(tmp_path):
-    path = _write(
-        tmp_path / "c.yaml", yaml.safe_dump({**SHORT, "distortion": DISTORTION, "model": "pinhole"})
-    )
-    _assert_same(Camera.from_file(path), LENS)
+    assert_same(read(tmp_path / "c.yaml", {**SHORT, "distortion": DISTORTION, "model": "pinhole"}), LENS)
 
 
 @pytest.mark.parametrize("suffix", ["yml", "xml"])
@@ -47,7 +33,7 @@ def test_opencv_file_storage(tmp_path, suffix, shape):
     storage.write("distortion_coefficients", np.array(DISTORTION).reshape(shape))
     storage.write("avg_reprojection_error", 0.3)
     storage.release()
-    _assert_same(Camera.from_file(path), LENS)
+    assert_same(Camera.from_file(path), LENS)
 
 
 @pytest.mark.parametrize(
@@ -69,16 +55,16 @@ def test_ros_camera_info(tmp_path, name, coefficients, model):
         "distortion_coefficients": {"rows": 1, "cols": len(coefficients), "data": coefficients},
     }
     same = Camera.from_parameters(**SHORT, distortion=coefficients, model=model)
-    _assert_same(Camera.from_file(_write(tmp_path / "c.yaml", yaml.safe_dump(fields))), same)
+    assert_same(read(tmp_path / "c.yaml", fields), same)
     if len(coefficients) == 8:  # of which the calibrator stated 5: image_pipeline#278
         fields["distortion_coefficients"]["cols"] = 5
-        _assert_same(Camera.from_file(_write(tmp_path / "c.yaml", yaml.safe_dump(fields))), same)
+        assert_same(read(tmp_path / "c.yaml", fields), same)
 
 
 def test_ros_message_dump(tmp_path):
     fields = {"width": 1280, "height": 720, "distortion_model": "plumb_bob"}
     fields |= {"K": LENS.intrinsics.flatten().tolist(), "D": DISTORTION}
-    _assert_same(Camera.from_file(_write(tmp_path / "c.yaml", yaml.safe_dump(fields))), LENS)
+    assert_same(read(tmp_path / "c.yaml", fields), LENS)
 
 
 P2 = "P2: 721.5377 0 609.5593 44.85728 0 721.5377 172.854 0.2163791 0 0 1 0.002745884\n"
@@ -86,14 +72,14 @@ P2 = "P2: 721.5377 0 609.5593 44.85728 0 721.5377 172.854 0.2163791 0 0 1 0.0027
 
 def test_kitti_object_file_knows_the_recording_day(tmp_path):
     camera = Camera.from_file(
-        _write(tmp_path / "calib.txt", "P0: " + P2[4:] + P2 + "R0_rect: 1 0 0 0 1 0 0 0 1\n")
+        written(tmp_path / "calib.txt", "P0: " + P2[4:] + P2 + "R0_rect: 1 0 0 0 1 0 0 0 1\n")
     )
     expected = Camera.from_parameters(721.5377, 721.5377, 609.5593, 172.854, 1242, 375)
-    _assert_same(camera, expected)
+    assert_same(camera, expected)
 
 
 def test_resized_kitti_images_need_their_own_camera(tmp_path):
-    path = _write(tmp_path / "calib.txt", P2)
+    path = written(tmp_path / "calib.txt", P2)
     assert Camera.from_file(path, image_size=(370, 1240)).image_size == (370, 1240)
     with pytest.raises(ValueError, match=r"expected images of about 1242 x 375 px.* got 621 x 188;"):
         Camera.from_file(path, image_size=(188, 621))
@@ -102,16 +88,16 @@ def test_resized_kitti_images_need_their_own_camera(tmp_path):
 def test_what_ros2_topic_echo_prints(tmp_path):
     matrix = "[500.0, 0.0, 320.0, 0.0, 500.0, 180.0, 0.0, 0.0, 1.0]"
     text = f"width: 640\nheight: 360\ndistortion_model: plumb_bob\nd: []\nk: {matrix}\n"
-    camera = Camera.from_file(_write(tmp_path / "info.yaml", f"{text}---\n"))
-    _assert_same(camera, Camera.from_parameters(500, 500, 320, 180, 640, 360))
+    camera = read(tmp_path / "info.yaml", f"{text}---\n")
+    assert_same(camera, Camera.from_parameters(500, 500, 320, 180, 640, 360))
 
 
 def test_kittis_images_as_its_cameras_took_them(tmp_path):
     text = "S_02: 1392 512\nK_02: 960 0 696 0 957 224 0 0 1\nD_02: -0.37 0.2 0.001 0.0006 -0.07\n"
-    path = _write(tmp_path / "calib.txt", f"{text}S_rect_02: 1242 375\n{P2.replace('P2', 'P_rect_02')}\n")
+    path = written(tmp_path / "calib.txt", f"{text}S_rect_02: 1242 375\n{P2.replace('P2', 'P_rect_02')}\n")
     lens = (-0.37, 0.2, 0.001, 0.0006, -0.07)
     expected = Camera.from_parameters(960, 957, 696, 224, 1392, 512, lens)
-    _assert_same(Camera.from_file(path, image_size=(512, 1392)), expected)
+    assert_same(Camera.from_file(path, image_size=(512, 1392)), expected)
     assert not len(Camera.from_file(path, image_size=(375, 1242)).distortion)
 
 
@@ -119,7 +105,7 @@ def test_kittis_images_as_its_cameras_took_them(tmp_path):
 def test_kittis_images_of_the_rectified_size_are_rectified(tmp_path, change):
     text = "S_02: 1392 512\nK_02: 960 0 696 0 957 224 0 0 1\nD_02: -0.37 0.2 0.001 0.0006 -0.07\n"
     text += f"S_rect_02: 1242 375\n{P2.replace('P2', 'P_rect_02')}\n"
-    path = _write(tmp_path / "calib.txt", text.replace(*change))
+    path = written(tmp_path / "calib.txt", text.replace(*change))
     for rectified in (False, True):
         assert not len(Camera.from_file(path, image_size=(512, 1392), rectified=rectified).distortion)
 
@@ -128,13 +114,13 @@ def test_kitti_raw_file_prefers_its_own_size(tmp_path):
     text = "calib_time: 09-Jan-2012\nS_rect_02: 1.242e+03 3.75e+02\nP_rect_02:" + P2[3:].replace(
         "721.5377", "700"
     )
-    camera = Camera.from_file(_write(tmp_path / "calib_cam_to_cam.txt", text), image_size=(10, 10))
+    camera = read(tmp_path / "calib_cam_to_cam.txt", text, image_size=(10, 10))
     assert camera.image_size == (375, 1242)
     assert float(camera.intrinsics[0, 0]) == 700
 
 
 def test_kitti_file_of_an_unknown_camera_needs_a_size(tmp_path):
-    path = _write(tmp_path / "calib.txt", P2.replace("721.5377", "700"))
+    path = written(tmp_path / "calib.txt", P2.replace("721.5377", "700"))
     with pytest.raises(ValueError, match=r"image size.*S_rect_02: WIDTH HEIGHT"):
         Camera.from_file(path)
     assert Camera.from_file(path, image_size=(370, 1224)).image_size == (370, 1224)
@@ -179,7 +165,7 @@ def test_kitti_file_of_an_unknown_camera_needs_a_size(tmp_path):
 )
 def test_bad_entries_are_one_clear_line(tmp_path, change, message):
     fields = {key: value for key, value in {**SHORT, **change}.items() if value is not None}
-    path = _write(tmp_path / "c.yaml", yaml.safe_dump(fields))
+    path = written(tmp_path / "c.yaml", fields)
     with pytest.raises(ValueError, match=message) as error:
         Camera.from_file(path)
     assert "\n" not in str(error.value)
@@ -219,7 +205,7 @@ def test_bad_entries_are_one_clear_line(tmp_path, change, message):
 )
 def test_malformed_files_are_one_clear_line(tmp_path, name, text, message):
     with pytest.raises(ValueError, match=message) as error:
-        Camera.from_file(_write(tmp_path / name, text))
+        read(tmp_path / name, text)
     assert "\n" not in str(error.value)
 
 
@@ -230,7 +216,7 @@ def test_matrix_cut_short(tmp_path):
         "camera_matrix": {"rows": 3, "cols": 3, "data": [1.0] * 8},
     }
     with pytest.raises(ValueError, match="camera_matrix: expected 9 numbers, got 8"):
-        Camera.from_file(_write(tmp_path / "c.yaml", yaml.safe_dump(fields)))
+        read(tmp_path / "c.yaml", fields)
 
 
 def test_missing_file(tmp_path):
@@ -250,7 +236,7 @@ def test_write_camera_round_trip(tmp_path, distortion, model):
     camera.to_file(tmp_path / "c.yaml")
     again = Camera.from_file(tmp_path / "c.yaml")
     padded = distortion + [0.0] * (5 - len(distortion)) if distortion and model == "pinhole" else distortion
-    _assert_same(again, Camera.from_parameters(**SHORT, distortion=padded, model=model))
+    assert_same(again, Camera.from_parameters(**SHORT, distortion=padded, model=model))
 
 
 POSE = Extrinsics(*(torch.tensor([value], dtype=torch.float64) for value in (0.05, -0.02, 0.01, 1.5)))
@@ -268,7 +254,7 @@ def mounted(status: list[int], progress: list[float], reasons: list[int]) -> Mou
 def test_calibration_file_is_read_by_others(tmp_path):
     path = tmp_path / "calibration.yaml"
     write_calibration(path, LENS, mounted([1] * 4, [100.0] * 4, [0, int(MountReason.SLOW), 0, 0]))
-    _assert_same(Camera.from_file(path), LENS)
+    assert_same(Camera.from_file(path), LENS)
     fields = yaml.safe_load(path.read_text())
     assert fields["mount"]["pitch_deg"] == pytest.approx(math.degrees(0.05), abs=1e-12)
     assert fields["mount"]["roll_std_deg"] == pytest.approx(math.degrees(0.03), abs=1e-12)

@@ -6,27 +6,16 @@ import cv2
 import numpy as np
 import pytest
 import torch
-import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lanebev import Camera
+from tests.camera.files import assert_is, assert_same, read, written
 
 LENS = Camera.from_parameters(812.5, 810.0, 641.25, 355.5, 1280, 720, [-0.31, 0.11, 0.0004, -0.0007, -0.017])
 K, D = LENS.intrinsics.flatten().tolist(), LENS.distortion.tolist()
 P = [700.0, 0.0, 630.0, -42.0, 0.0, 700.0, 360.0, 0.0, 0.0, 0.0, 1.0, 0.0]
 TILTED = [0.8, -0.4, 0.0003, 0.0002, 0.05, 1.1, -0.35, 0.02, 4e-4, -1e-4, 2e-4, 1e-4, 0.004, -0.003]
-
-
-def _same(camera, expected):
-    torch.testing.assert_close(camera.intrinsics, expected.intrinsics, rtol=0, atol=1e-12)
-    torch.testing.assert_close(camera.distortion, expected.distortion, rtol=0, atol=0)
-    assert (camera.model, camera.image_size) == (expected.model, expected.image_size)
-
-
-def _write(path, content):
-    path.write_text(content if isinstance(content, str) else yaml.safe_dump(content))
-    return path
 
 
 def _message(**fields):
@@ -52,7 +41,7 @@ def test_opencv_file_storage_of_every_format(tmp_path, suffix):
     storage.write("distortion_coefficients", np.array(TILTED).reshape(14, 1))
     storage.write("avg_reprojection_error", 3e-05)
     storage.release()
-    _same(Camera.from_file(path), Camera.from_parameters(812.5, 810, 641.25, 355.5, 1280, 720, TILTED))
+    assert_is(Camera.from_file(path), 812.5, 810, 641.25, 355.5, 1280, 720, TILTED)
 
 
 @pytest.mark.parametrize("suffix", ["json", "yml", "xml"])
@@ -69,9 +58,9 @@ def test_opencvs_omnidirectional_calibration(tmp_path, suffix):
     expected = Camera.from_parameters(
         812.5, 810, 641.25, 355.5, 1280, 720, [1.3, -0.1, 0.2, 0.001, -0.002], "omni"
     )
-    _same(Camera.from_file(path), expected)
+    assert_same(Camera.from_file(path), expected)
     expected.to_file(tmp_path / "own.yaml")
-    _same(Camera.from_file(tmp_path / "own.yaml"), expected)
+    assert_same(Camera.from_file(tmp_path / "own.yaml"), expected)
 
 
 @pytest.mark.parametrize(
@@ -79,13 +68,13 @@ def test_opencvs_omnidirectional_calibration(tmp_path, suffix):
 )
 def test_an_ideal_camera_with_an_empty_model(tmp_path, fields):
     ideal = Camera.from_parameters(812.5, 810, 641.25, 355.5, 1280, 720)
-    _same(Camera.from_file(_write(tmp_path / "c.yaml", _message(**fields))), ideal)
+    assert_same(read(tmp_path / "c.yaml", _message(**fields)), ideal)
     empty = {"rows": 1, "cols": 0, "data": []}
     written = {
         "image_width": 1280, "image_height": 720, "camera_name": "front", "distortion_model": "",
         "camera_matrix": {"rows": 3, "cols": 3, "data": K}, "distortion_coefficients": empty,
     }  # fmt: skip
-    _same(Camera.from_file(_write(tmp_path / "d.yaml", written)), ideal)
+    assert_same(read(tmp_path / "d.yaml", written), ideal)
 
 
 @pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
@@ -107,21 +96,21 @@ def test_byte_order_marks(tmp_path, encoding, name):
         storage.release()
         text, expected = path.read_text(), LENS
     path.write_text(text, encoding=encoding)
-    _same(Camera.from_file(path), expected)
+    assert_same(Camera.from_file(path), expected)
 
 
 @pytest.mark.parametrize("width", ["0640", "640", "640.0", "6.4e2", "'640'", "!!int 0640"])
 def test_numbers_are_decimal_as_they_are_written(tmp_path, width):
     text = f"fx: 0500\nfy: 5e2\ncx: 320\ncy: 0240.5\nwidth: {width}\nheight: 0480\n"
-    camera = Camera.from_file(_write(tmp_path / "c.yaml", text))
-    _same(camera, Camera.from_parameters(500, 500, 320, 240.5, 640, 480))
+    camera = read(tmp_path / "c.yaml", text)
+    assert_is(camera, 500, 500, 320, 240.5, 640, 480)
 
 
 @pytest.mark.parametrize("width", ["0x280", "0o1200", "10:40", "0b1010000000", "yes", "2024-01-01", "~"])
 def test_numbers_of_other_bases_are_none(tmp_path, width):
     text = f"fx: 500\nfy: 500\ncx: 320\ncy: 240\nwidth: {width}\nheight: 480\n"
     with pytest.raises(ValueError, match=r"width: expected (finite numbers, got|a value, got none)"):
-        Camera.from_file(_write(tmp_path / "c.yaml", text))
+        read(tmp_path / "c.yaml", text)
 
 
 @pytest.mark.parametrize(
@@ -131,42 +120,42 @@ def test_numbers_of_other_bases_are_none(tmp_path, width):
 def test_cropped_cameras_that_were_written_are_read(tmp_path, box, distortion):
     whole = Camera.from_parameters(812.5, 810, 641.25, 355.5, 1280, 720, distortion)
     whole.cropped(*box).to_file(tmp_path / "c.yaml")
-    _same(Camera.from_file(tmp_path / "c.yaml"), whole.cropped(*box))
+    assert_same(Camera.from_file(tmp_path / "c.yaml"), whole.cropped(*box))
 
 
 def test_a_principal_point_outside_is_a_mistake_where_a_person_wrote_it(tmp_path):
     fields = {"fx": 500, "fy": 500, "cx": -20, "cy": 240, "width": 640, "height": 480}
     with pytest.raises(ValueError, match=r"cx: expected a principal point inside .* Camera\.cropped"):
-        Camera.from_file(_write(tmp_path / "c.yaml", fields))
+        read(tmp_path / "c.yaml", fields)
     with pytest.raises(
         ValueError, match="cx: expected a principal point inside"
     ):  # R = I, but P is not [K | 0]
-        Camera.from_file(_write(tmp_path / "c.yaml", _message(width=600)))
+        read(tmp_path / "c.yaml", _message(width=600))
 
 
 def test_ros_binning_and_region_of_interest_are_applied(tmp_path):
-    binned = Camera.from_file(_write(tmp_path / "c.yaml", _message(binning_x=2, binning_y=2)))
-    _same(binned, LENS.scaled((360, 640)))
+    binned = read(tmp_path / "c.yaml", _message(binning_x=2, binning_y=2))
+    assert_same(binned, LENS.scaled((360, 640)))
     roi = {"x_offset": 200, "y_offset": 100, "height": 400, "width": 801, "do_rectify": True}
-    cut = Camera.from_file(_write(tmp_path / "c.yaml", _message(roi=roi)))
-    _same(cut, LENS.cropped(100, 200, 400, 801))
-    both = Camera.from_file(_write(tmp_path / "c.yaml", _message(roi=roi, binning_x=2, binning_y=4)))
-    _same(both, LENS.cropped(100, 200, 400, 800).scaled((100, 400)))
-    ideal = Camera.from_file(_write(tmp_path / "c.yaml", _message(roi=roi, binning_x=2)), rectified=True)
-    _same(
+    cut = read(tmp_path / "c.yaml", _message(roi=roi))
+    assert_same(cut, LENS.cropped(100, 200, 400, 801))
+    both = read(tmp_path / "c.yaml", _message(roi=roi, binning_x=2, binning_y=4))
+    assert_same(both, LENS.cropped(100, 200, 400, 800).scaled((100, 400)))
+    ideal = read(tmp_path / "c.yaml", _message(roi=roi, binning_x=2), rectified=True)
+    assert_same(
         ideal,
         Camera.from_parameters(700, 700, 630, 360, 1280, 720).cropped(100, 200, 400, 800).scaled((400, 400)),
     )
-    _same(Camera.from_file(_write(tmp_path / "c.yaml", _message(binning_x=1, binning_y=1))), LENS)
+    assert_same(read(tmp_path / "c.yaml", _message(binning_x=1, binning_y=1)), LENS)
 
 
 def test_a_region_of_interest_may_leave_out_the_principal_point(tmp_path):
     for roi in ({"width": 600, "height": 700}, {"y_offset": 400}):
-        cut = Camera.from_file(_write(tmp_path / "c.yaml", _message(roi=roi)))
+        cut = read(tmp_path / "c.yaml", _message(roi=roi))
         expected = LENS.cropped(roi.get("y_offset", 0), 0, roi.get("height", 320), roi.get("width", 1280))
-        _same(cut, expected)
+        assert_same(cut, expected)
     with pytest.raises(ValueError, match="cx: expected a principal point inside the image, 0 to 1280"):
-        Camera.from_file(_write(tmp_path / "c.yaml", _message(K=[812.5, 0, 1300, 0, 810, 355, 0, 0, 1])))
+        read(tmp_path / "c.yaml", _message(K=[812.5, 0, 1300, 0, 810, 355, 0, 0, 1]))
 
 
 @pytest.mark.parametrize(
@@ -191,17 +180,17 @@ def test_a_region_of_interest_may_leave_out_the_principal_point(tmp_path):
 )
 def test_impossible_messages_are_one_clear_line(tmp_path, fields, message):
     with pytest.raises(ValueError, match=message) as error:
-        Camera.from_file(_write(tmp_path / "c.yaml", _message(**fields)))
+        read(tmp_path / "c.yaml", _message(**fields))
     assert "\n" not in str(error.value)
 
 
 def test_rectified_images_have_the_projection_matrix_and_no_lens(tmp_path):
-    path = _write(tmp_path / "c.yaml", _message())
-    _same(Camera.from_file(path, rectified=True), Camera.from_parameters(700, 700, 630, 360, 1280, 720))
-    _same(Camera.from_file(path), LENS)
+    path = written(tmp_path / "c.yaml", _message())
+    assert_is(Camera.from_file(path, rectified=True), 700, 700, 630, 360, 1280, 720)
+    assert_same(Camera.from_file(path), LENS)
     LENS.to_file(tmp_path / "own.yaml")
     ideal = Camera.from_parameters(812.5, 810, 641.25, 355.5, 1280, 720)
-    _same(Camera.from_file(tmp_path / "own.yaml", rectified=True), ideal)
+    assert_same(Camera.from_file(tmp_path / "own.yaml", rectified=True), ideal)
     message = _message()
     del message["P"]
     short = {"fx": 500, "fy": 500, "cx": 320, "cy": 240, "width": 640, "height": 480}
@@ -211,9 +200,9 @@ def test_rectified_images_have_the_projection_matrix_and_no_lens(tmp_path):
         {**short, "distortion": [0.0] * 4, "model": "fisheye"},
     ):
         with pytest.raises(ValueError, match="projection_matrix: expected P for rectified images, got none"):
-            Camera.from_file(_write(tmp_path / "c.yaml", fields), rectified=True)
+            read(tmp_path / "c.yaml", fields, rectified=True)
     expected = Camera.from_parameters(500, 500, 320, 240, 640, 480)
-    _same(Camera.from_file(_write(tmp_path / "c.yaml", short), rectified=True), expected)
+    assert_same(read(tmp_path / "c.yaml", short, rectified=True), expected)
 
 
 FISHEYE = [0.01, 0.02, -0.01, 0.0]
@@ -250,8 +239,8 @@ cam1:
     ],
 )  # fmt: skip
 def test_kalibrs_camera_chain(tmp_path, model, coefficients, distortion, intrinsics, expected):
-    path = _write(tmp_path / "camchain.yaml", KALIBR.format(model, coefficients, distortion, intrinsics))
-    _same(Camera.from_file(path), Camera.from_parameters(812.5, 810, 641.25, 355.5, 1280, 720, *expected))
+    path = written(tmp_path / "camchain.yaml", KALIBR.format(model, coefficients, distortion, intrinsics))
+    assert_is(Camera.from_file(path), 812.5, 810, 641.25, 355.5, 1280, 720, *expected)
 
 
 @pytest.mark.parametrize("name", ["radial-tangential", "equidistant"])
@@ -276,7 +265,7 @@ distortion_coefficients: [-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05]
     model = "pinhole" if name == "radial-tangential" else "fisheye"
     distortion = [-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05]
     expected = Camera.from_parameters(458.654, 457.296, 367.215, 248.375, 752, 480, distortion, model)
-    _same(Camera.from_file(_write(tmp_path / "sensor.yaml", text)), expected)
+    assert_same(read(tmp_path / "sensor.yaml", text), expected)
 
 
 CAMODOCAL = """%YAML:1.0
@@ -312,26 +301,26 @@ KANNALA = """projection_parameters:
 
 
 def test_camodocals_cameras(tmp_path):
-    path = _write(tmp_path / "image_02.yaml", CAMODOCAL.format("MEI") + MEI)
+    path = written(tmp_path / "image_02.yaml", CAMODOCAL.format("MEI") + MEI)
     expected = [2.2, 0.016, 1.65, 0.0004, -0.0003]
-    _same(
+    assert_same(
         Camera.from_file(path),
         Camera.from_parameters(1336.3, 1335.8, 716.9, 705.7, 1400, 1400, expected, "mei"),
     )
-    path = _write(tmp_path / "a.yaml", CAMODOCAL.format("KANNALA_BRANDT") + KANNALA)
+    path = written(tmp_path / "a.yaml", CAMODOCAL.format("KANNALA_BRANDT") + KANNALA)
     expected = Camera.from_parameters(
         600, 601, 716.9, 705.7, 1400, 1400, [0.01, -0.02, 0.003, 0.0], "fisheye"
     )
-    _same(Camera.from_file(path), expected)
+    assert_same(Camera.from_file(path), expected)
     pinhole = MEI[MEI.index("distortion") :].replace("gamma1", "fx").replace("gamma2", "fy")
     pinhole = pinhole.replace("u0", "cx").replace("v0", "cy")
-    path = _write(tmp_path / "a.yaml", CAMODOCAL.format("PINHOLE") + pinhole)
+    path = written(tmp_path / "a.yaml", CAMODOCAL.format("PINHOLE") + pinhole)
     expected = [0.016, 1.65, 0.0004, -0.0003]
-    _same(Camera.from_file(path), Camera.from_parameters(1336.3, 1335.8, 716.9, 705.7, 1400, 1400, expected))
+    assert_is(Camera.from_file(path), 1336.3, 1335.8, 716.9, 705.7, 1400, 1400, expected)
     with pytest.raises(
         ValueError, match="model_type: expected PINHOLE, KANNALA_BRANDT or MEI, got 'SCARAMUZZA'"
     ):
-        Camera.from_file(_write(path, CAMODOCAL.format("SCARAMUZZA") + MEI))
+        read(path, CAMODOCAL.format("SCARAMUZZA") + MEI)
 
 
 def test_nuscenes_and_openlane_json(tmp_path):
@@ -342,8 +331,8 @@ def test_nuscenes_and_openlane_json(tmp_path):
     lidar = {**record, "camera_intrinsic": []}
     for content in ({**record, "camera_intrinsic": matrix}, [lidar, {**record, "camera_intrinsic": matrix}]):
         path.write_text(json.dumps(content))
-        _same(Camera.from_file(path), expected)
-        _same(Camera.from_file(path, image_size=(900, 1600)), expected)
+        assert_same(Camera.from_file(path), expected)
+        assert_same(Camera.from_file(path, image_size=(900, 1600)), expected)
     with pytest.raises(ValueError, match="expected images of about 1600 x 900 px, nuScenes', got 800 x 450"):
         Camera.from_file(path, image_size=(450, 800))
     with pytest.raises(ValueError, match="nuScenes', got 1920 x 1080"):
@@ -352,7 +341,7 @@ def test_nuscenes_and_openlane_json(tmp_path):
         own = [[500.0, 0.0, 0.51 * width], [0.0, 500.0, 0.49 * height], [0.0, 0.0, 1.0]]
         path.write_text(json.dumps([{**record, "camera_intrinsic": own}]))
         expected = Camera.from_parameters(500.0, 500.0, 0.51 * width, 0.49 * height, width, height)
-        _same(Camera.from_file(path, image_size=(height, width)), expected)
+        assert_same(Camera.from_file(path, image_size=(height, width)), expected)
         with pytest.raises(ValueError, match="expected images of about 1600 x 900"):
             Camera.from_file(path, image_size=(height // 2, width // 2))
     other = [[1200.0, 0.0, 800.0], *matrix[1:]]
@@ -362,7 +351,7 @@ def test_nuscenes_and_openlane_json(tmp_path):
     path.write_text(
         json.dumps({"intrinsic": [[2059, 0, 935.1], [0, 2059, 635], [0, 0, 1]], "lane_lines": []})
     )
-    _same(Camera.from_file(path), Camera.from_parameters(2059, 2059, 935.1, 635, 1920, 1280))
+    assert_is(Camera.from_file(path), 2059, 2059, 935.1, 635, 1920, 1280)
 
 
 @pytest.mark.parametrize(
@@ -392,7 +381,7 @@ def test_nuscenes_and_openlane_json(tmp_path):
 )
 def test_malformed_files_are_one_clear_line(tmp_path, name, text, message):
     with pytest.raises(ValueError, match=message) as error:
-        Camera.from_file(_write(tmp_path / name, text))
+        read(tmp_path / name, text)
     assert "\n" not in str(error.value)
     assert str(tmp_path) in str(error.value)
 
@@ -402,7 +391,7 @@ def test_files_that_unfold_to_endless_ones_are_refused_at_once(tmp_path):
     for before, name in zip("abcdefgh", "bcdefghi", strict=True):
         bomb += f"{name}: &{name} [{', '.join(['*' + before] * 9)}]\n"
     with pytest.raises(ValueError, match="unknown key 'a'"):
-        Camera.from_file(_write(tmp_path / "c.yaml", bomb))
+        read(tmp_path / "c.yaml", bomb)
     wide = (
         "header: &a ["
         + "1, " * 2000
@@ -411,7 +400,7 @@ def test_files_that_unfold_to_endless_ones_are_refused_at_once(tmp_path):
         + "*a]\n"
     )
     with pytest.raises(ValueError, match="camera_matrix: expected a few numbers, got more than 1000"):
-        Camera.from_file(_write(tmp_path / "c.yaml", wide))
+        read(tmp_path / "c.yaml", wide)
 
 
 lengths = st.sampled_from([("pinhole", n) for n in (0, 4, 5, 8, 12, 14)] + [("fisheye", 4), ("omni", 5)])
@@ -451,8 +440,8 @@ def test_a_run_on_rectified_images(tmp_path):
     camera["K"][8] = camera["P"][10] = 1.0
     (tmp_path / "0.lines.txt").write_text("")
     paths = {"source": "[0].png", "camera": "c.yaml", "lanes": "0.lines.txt", "out": "out"}
-    _write(tmp_path / "c.yaml", camera)
+    written(tmp_path / "c.yaml", camera)
     report = run(RunConfig(**{key: str(tmp_path / name) for key, name in paths.items()}, rectified=True))
     assert report.facts["camera"].endswith("pinhole, f = 70.0 / 70.0 px")
-    written = Camera.from_file(tmp_path / "out" / "calibration.yaml")
-    _same(written, Camera.from_parameters(70, 70, 63, 36, 128, 72))
+    again = Camera.from_file(tmp_path / "out" / "calibration.yaml")
+    assert_is(again, 70, 70, 63, 36, 128, 72)

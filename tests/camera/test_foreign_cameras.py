@@ -11,6 +11,7 @@ import torch
 import yaml
 
 from lanebev import Camera
+from tests.camera.files import assert_is, read
 
 # what ROS melodic's camera_calibration writes (image_pipeline#682)
 OST = """image_width: 1640
@@ -44,18 +45,6 @@ COLMAP = {  # numbers of its models
 MATRIX = [[633.0, 0, 408.0], [0, 633.0, 245.0], [0, 0, 1]]
 
 
-def _read(path, text, **kwargs):
-    path.write_bytes(text if isinstance(text, bytes) else text.encode())
-    return Camera.from_file(path, **kwargs)
-
-
-def _is(camera, *parameters):
-    expected = Camera.from_parameters(*parameters)
-    torch.testing.assert_close(camera.intrinsics, expected.intrinsics, rtol=0, atol=1e-9)
-    torch.testing.assert_close(camera.distortion, expected.distortion, rtol=0, atol=0)
-    assert (camera.model, camera.image_size) == (expected.model, expected.image_size)
-
-
 @pytest.mark.parametrize(
     ("line", "model"),
     [
@@ -79,7 +68,7 @@ def _is(camera, *parameters):
     ],
 )
 def test_the_lens_has_the_model_that_the_file_names(tmp_path, line, model):
-    camera = _read(tmp_path / "ost.yaml", OST.replace(MODEL, line))
+    camera = read(tmp_path / "ost.yaml", OST.replace(MODEL, line))
     assert camera.model == model
     assert camera.intrinsics[0, 1] == -0.96635  # skew
 
@@ -87,14 +76,14 @@ def test_the_lens_has_the_model_that_the_file_names(tmp_path, line, model):
 @pytest.mark.parametrize("name", ["none", "None", "no_distortion"])
 def test_a_camera_may_state_that_it_has_no_lens(tmp_path, name):
     zeros = OST.replace("[0.175653, -0.031772, 0.000362, -0.000719]", "[0, 0, 0, 0]")
-    camera = _read(tmp_path / "c.yaml", zeros.replace(MODEL, f"distortion_model: {name}"))
+    camera = read(tmp_path / "c.yaml", zeros.replace(MODEL, f"distortion_model: {name}"))
     assert (camera.model, camera.distortion.tolist()) == ("pinhole", [])
     with pytest.raises(ValueError, match="model: expected the lens model of the coefficients, got none"):
-        _read(tmp_path / "c.yaml", OST.replace(MODEL, f"distortion_model: {name}"))
+        read(tmp_path / "c.yaml", OST.replace(MODEL, f"distortion_model: {name}"))
 
 
 def test_skew_moves_pixels_as_opencv_moves_them(tmp_path):
-    camera = _read(tmp_path / "ost.yaml", OST)
+    camera = read(tmp_path / "ost.yaml", OST)
     rays = torch.tensor([[0.1, 0.3], [-0.5, 0.2], [0.4, -0.4]], dtype=torch.float64)
     ideal = rays @ camera.intrinsics[:2, :2].mT + camera.intrinsics[:2, 2]
     given = (camera.intrinsics.numpy(), camera.distortion.numpy())
@@ -115,26 +104,26 @@ def test_skew_moves_pixels_as_opencv_moves_them(tmp_path):
 )
 @pytest.mark.parametrize("encoding", ["utf-8", "latin-1"])
 def test_ends_of_lines_tabs_between_words_and_foreign_letters(tmp_path, old, new, encoding):
-    plain = _read(tmp_path / "c.yaml", OST)
-    changed = _read(tmp_path / "d.yaml", OST.replace(old, new).encode(encoding))
+    plain = read(tmp_path / "c.yaml", OST)
+    changed = read(tmp_path / "d.yaml", OST.replace(old, new).encode(encoding))
     assert changed.fingerprint() == plain.fingerprint()
 
 
 def test_spaces_of_web_pages(tmp_path):
-    copied = _read(tmp_path / "c.yaml", OST.replace(": ", ":\u00a0"))
-    assert copied.fingerprint() == _read(tmp_path / "c.yaml", OST).fingerprint()
+    copied = read(tmp_path / "c.yaml", OST.replace(": ", ":\u00a0"))
+    assert copied.fingerprint() == read(tmp_path / "c.yaml", OST).fingerprint()
 
 
 def test_rows_that_are_indented_by_tabs_are_one_clear_line(tmp_path):
     with pytest.raises(ValueError, match=r"expected YAML, got a tab at line 5; indent by spaces$"):
-        _read(tmp_path / "c.yaml", OST.replace("\n  ", "\n\t"))
+        read(tmp_path / "c.yaml", OST.replace("\n  ", "\n\t"))
 
 
 def test_foxglove_prints_a_cameras_message(tmp_path):
     fields = {"timestamp": {"sec": 1, "nsec": 2}, "frame_id": "front", "width": 1280, "height": 720}
     fields |= {"distortion_model": "plumb_bob", "D": [-0.3, 0.1, 0, 0, 0], "R": [], "P": []}
-    camera = _read(tmp_path / "c.json", json.dumps({**fields, "K": [800, 0, 640, 0, 801, 360, 0, 0, 1]}))
-    _is(camera, 800, 801, 640, 360, 1280, 720, [-0.3, 0.1, 0, 0, 0])
+    camera = read(tmp_path / "c.json", {**fields, "K": [800, 0, 640, 0, 801, 360, 0, 0, 1]})
+    assert_is(camera, 800, 801, 640, 360, 1280, 720, [-0.3, 0.1, 0, 0, 0])
 
 
 INI = """# oST version 5.0 parameters
@@ -173,12 +162,12 @@ projection
 @pytest.mark.parametrize("name", ["ost.txt", "left.ini"])
 def test_ros_ini(tmp_path, name):  # image_common#33
     distortion = [0.189544, -0.018229, -0.000630, 0.000054, -0.000212]
-    _is(_read(tmp_path / name, INI), 369.344588, 367.15433, 320.739078, 203.59245, 640, 480, distortion)
-    _is(_read(tmp_path / name, INI, rectified=True), 262.9, 302.1, 320.9, 188.5, 640, 480)
+    assert_is(read(tmp_path / name, INI), 369.344588, 367.15433, 320.739078, 203.59245, 640, 480, distortion)
+    assert_is(read(tmp_path / name, INI, rectified=True), 262.9, 302.1, 320.9, 188.5, 640, 480)
     with pytest.raises(ValueError, match="camera_matrix: expected 9 numbers, got 6"):
-        _read(tmp_path / name, INI.replace("0.000000 0.000000 1.000000\n\ndist", "\ndist"))
+        read(tmp_path / name, INI.replace("0.000000 0.000000 1.000000\n\ndist", "\ndist"))
     with pytest.raises(ValueError, match="expected each key once, got 'camera_matrix' twice"):
-        _read(tmp_path / name, INI + INI[INI.index("[mono") :])
+        read(tmp_path / name, INI + INI[INI.index("[mono") :])
 
 
 P = "7.2e+02 0 6.09e+02 4.4e+01 0 7.2e+02 1.7e+02 2.1e-01 0 0 1 2.7e-03"
@@ -190,8 +179,8 @@ P = "7.2e+02 0 6.09e+02 4.4e+01 0 7.2e+02 1.7e+02 2.1e-01 0 0 1 2.7e-03"
     [f"P0: {P}\nP2: {P}\nR_rect 9.9e-01 1\nTr_velo_cam 7.5\n\n", f"  P2 :\t{P}\r\n", f"P_rect_00: {P}\n"],
 )
 def test_kittis_files_by_any_name(tmp_path, name, text):
-    camera = _read(tmp_path / name, text, image_size=(375, 1242))
-    _is(camera, 720, 720, 609, 170, 1242, 375)
+    camera = read(tmp_path / name, text, image_size=(375, 1242))
+    assert_is(camera, 720, 720, 609, 170, 1242, 375)
 
 
 @pytest.mark.parametrize(
@@ -219,15 +208,15 @@ def test_kittis_files_by_any_name(tmp_path, name, text):
 def test_colmaps_pixels_begin_at_their_corner(tmp_path, line, expected):  # colmap#2587
     distortion, model, fy = expected
     text = f"# Camera list with one line of data per camera:\n#   CAMERA_ID, MODEL\n1 {line}\n"
-    camera = _read(tmp_path / "cameras.txt", text)
-    _is(camera, 800, fy, 639.5, 359.5, 1280, 720, distortion, model)
+    camera = read(tmp_path / "cameras.txt", text)
+    assert_is(camera, 800, fy, 639.5, 359.5, 1280, 720, distortion, model)
     name, *sides, values = line.split(maxsplit=3)
     values = [float(value) for value in values.split()]
     data = struct.pack(f"<QiiQQ{len(values)}d", 1, 1, COLMAP[name], *map(int, sides), *values)
-    _is(_read(tmp_path / "cameras.bin", data), 800, fy, 639.5, 359.5, 1280, 720, distortion, model)
+    assert_is(read(tmp_path / "cameras.bin", data), 800, fy, 639.5, 359.5, 1280, 720, distortion, model)
     for cut in (data[:-8], data[:40], data[:8], data + b"1"):
         with pytest.raises(ValueError, match=r"got: a cameras\.bin of COLMAP that is cut, or"):
-            _read(tmp_path / "cameras.bin", cut)
+            read(tmp_path / "cameras.bin", cut)
 
 
 ORB_SLAM = """%YAML:1.0
@@ -323,16 +312,16 @@ ORBextractor.nFeatures: 1200
 )
 def test_what_is_no_camera_is_one_clear_line(tmp_path, name, text, message):
     with pytest.raises(ValueError, match=message) as error:
-        _read(tmp_path / name, text)
+        read(tmp_path / name, text)
     assert "\n" not in str(error.value)
 
 
 @pytest.mark.parametrize("key", ["camera_intrinsic", "intrinsic"])
 def test_a_data_sets_format_with_other_images(tmp_path, key):
     stated = json.dumps({key: MATRIX, "width": 800, "height": 450})
-    _is(_read(tmp_path / "c.json", stated, image_size=(900, 1600)), 633, 633, 408, 245, 800, 450)
-    _is(
-        _read(tmp_path / "c.json", json.dumps({key: MATRIX}), image_size=(450, 800)),
+    assert_is(read(tmp_path / "c.json", stated, image_size=(900, 1600)), 633, 633, 408, 245, 800, 450)
+    assert_is(
+        read(tmp_path / "c.json", {key: MATRIX}, image_size=(450, 800)),
         633,
         633,
         408,
@@ -350,22 +339,22 @@ def test_a_matrix_of_the_binned_images_is_refused(tmp_path):  # avt_vimba_camera
         "camera_matrix: expected one for the full 2064 x 1544 px, got .* if the matrix is for these, write w"
     )
     with pytest.raises(ValueError, match=message):
-        _read(tmp_path / "c.json", json.dumps({**fields, "K": matrix}))
+        read(tmp_path / "c.json", {**fields, "K": matrix})
     with pytest.raises(ValueError, match=message):
-        _read(
+        read(
             tmp_path / "c.json",
             json.dumps({**fields, "P": [*matrix[:3], 0, *matrix[3:6], 0, 0, 0, 1, 0]}),
             rectified=True,
         )
     full = [4 * matrix[0], 0, 4 * matrix[2], 0, 4 * matrix[4], 4 * matrix[5], 0, 0, 1]
-    assert _read(tmp_path / "c.json", json.dumps({**fields, "K": full})).image_size == (386, 516)
+    assert read(tmp_path / "c.json", {**fields, "K": full}).image_size == (386, 516)
 
 
 @pytest.mark.parametrize("rectified", [False, True])
 def test_kittis_camera_of_resized_images_is_refused(tmp_path, rectified):
     text = "P2: 800 0 700 0 0 800 250 0 0 0 1 0\n"  # of no known recording day
-    _is(
-        _read(tmp_path / "c.txt", text, image_size=(500, 1400), rectified=rectified),
+    assert_is(
+        read(tmp_path / "c.txt", text, image_size=(500, 1400), rectified=rectified),
         800,
         800,
         700,
@@ -376,14 +365,14 @@ def test_kittis_camera_of_resized_images_is_refused(tmp_path, rectified):
     with pytest.raises(
         ValueError, match="P2: expected a camera of the images' 700 x 250 px, got a principal"
     ):
-        _read(tmp_path / "c.txt", text, image_size=(250, 700), rectified=rectified)
+        read(tmp_path / "c.txt", text, image_size=(250, 700), rectified=rectified)
 
 
 def test_rectified_images_have_no_lens_of_colmaps(tmp_path):
     with pytest.raises(ValueError, match="projection_matrix: expected P for rectified images, got none"):
-        _read(tmp_path / "cameras.txt", "1 RADIAL 1280 720 800 640 360 -0.3 0.1\n", rectified=True)
-    camera = _read(tmp_path / "cameras.txt", "1 SIMPLE_PINHOLE 1280 720 800 640 360\n", rectified=True)
-    _is(camera, 800, 800, 639.5, 359.5, 1280, 720)
+        read(tmp_path / "cameras.txt", "1 RADIAL 1280 720 800 640 360 -0.3 0.1\n", rectified=True)
+    camera = read(tmp_path / "cameras.txt", "1 SIMPLE_PINHOLE 1280 720 800 640 360\n", rectified=True)
+    assert_is(camera, 800, 800, 639.5, 359.5, 1280, 720)
 
 
 @pytest.mark.parametrize("of", ["", "1"])
@@ -404,12 +393,12 @@ def test_rectified_images_have_no_lens_of_colmaps(tmp_path):
     ],
 )
 def test_orb_slams_settings(tmp_path, of, kind, more, expected):  # ORB_SLAM3#493
-    camera = _read(tmp_path / "c.yaml", ORB_SLAM.format(kind, of, more.format(of)))
-    _is(camera, 458.654, 457.296, 367.215, 248.375, 752, 480, *expected)
+    camera = read(tmp_path / "c.yaml", ORB_SLAM.format(kind, of, more.format(of)))
+    assert_is(camera, 458.654, 457.296, 367.215, 248.375, 752, 480, *expected)
     with pytest.raises(ValueError, match=r"Camera\.type: expected one of pinhole, .*, fisheye, got 'Omni'"):
-        _read(tmp_path / "c.yaml", ORB_SLAM.format("Omni", of, ""))
+        read(tmp_path / "c.yaml", ORB_SLAM.format("Omni", of, ""))
     with pytest.raises(ValueError, match=r"Camera\.height: expected a value, got none"):
-        _read(tmp_path / "c.yaml", ORB_SLAM.format(kind, of, "").replace("Camera.height", "Camera.high"))
+        read(tmp_path / "c.yaml", ORB_SLAM.format(kind, of, "").replace("Camera.height", "Camera.high"))
 
 
 BASALT = {
@@ -453,30 +442,30 @@ cameras:
 
 
 def test_calibrations_of_basalt_and_maplab(tmp_path):  # maplab#4
-    camera = _read(tmp_path / "c.yaml", MAPLAB)
-    _is(camera, 458.654, 457.296, 367.215, 248.375, 752, 480, [-0.28, 0.07, 0.0002, 0.00002])
+    camera = read(tmp_path / "c.yaml", MAPLAB)
+    assert_is(camera, 458.654, 457.296, 367.215, 248.375, 752, 480, [-0.28, 0.07, 0.0002, 0.00002])
     (tmp_path / "calibration.json").write_text(json.dumps(BASALT))
     first = Camera.from_file(f"{tmp_path / 'calibration.json'}#cam0")
-    _is(first, 350, 351, 366, 249, 752, 480, [0.01, -0.02, 0.003, 0.0], "fisheye")
+    assert_is(first, 350, 351, 366, 249, 752, 480, [0.01, -0.02, 0.003, 0.0], "fisheye")
     second = Camera.from_file(f"{tmp_path / 'calibration.json'}#cam1")
-    _is(second, 450, 451, 370, 250, 752, 480)
+    assert_is(second, 450, 451, 370, 250, 752, 480)
     sphere = {"fx": 349.7, "fy": 348.7, "cx": 365.8, "cy": 249.3, "xi": -0.28, "alpha": 0.57}
     kalibr = {"cam0": {"camera_model": "ds", "distortion_model": "none", "resolution": [752, 480]}}
     kalibr["cam0"]["intrinsics"] = [-0.28, 0.57, 349.7, 348.7, 365.8, 249.3]
     basalt = {"intrinsics": [{"camera_type": "ds", "intrinsics": sphere}], "resolution": [[752, 480]]}
-    one, other = (_read(tmp_path / "c.json", json.dumps(each)) for each in ({"value0": basalt}, kalibr))
+    one, other = (read(tmp_path / "c.json", each) for each in ({"value0": basalt}, kalibr))
     assert one.fingerprint() == other.fingerprint()
     lens = [-0.3, 0.1, 0.001, 0.002, 0.01, 0.02, 0.03, 0.04]
     named = dict(zip(("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"), lens, strict=True))
     rational = {"camera_type": "pinhole-radtan8", "intrinsics": {**sphere, **named, "rpmax": 2.7}}
     rational = {"intrinsics": [rational], "resolution": [[752, 480]]}
-    camera = _read(tmp_path / "c.json", json.dumps({"value0": rational}))
-    _is(camera, 349.7, 348.7, 365.8, 249.3, 752, 480, lens)
+    camera = read(tmp_path / "c.json", {"value0": rational})
+    assert_is(camera, 349.7, 348.7, 365.8, 249.3, 752, 480, lens)
     basalt["intrinsics"][0]["camera_type"] = "ftheta"
     with pytest.raises(ValueError, match=r"camera_type: expected one of ds, eucm, pinhole, .*, got 'ftheta'"):
-        _read(tmp_path / "c.json", json.dumps({"value0": basalt}))
+        read(tmp_path / "c.json", {"value0": basalt})
     with pytest.raises(ValueError, match="resolution: expected the image size of each camera, got none"):
-        _read(tmp_path / "c.json", json.dumps({"value0": {**basalt, "resolution": None}}))
+        read(tmp_path / "c.json", json.dumps({"value0": {**basalt, "resolution": None}}))
 
 
 MESSAGE = (
@@ -486,15 +475,15 @@ MESSAGE = (
 
 def test_a_fisheye_may_have_zeros_after_its_coefficients(tmp_path):
     parameters = (500, 500, 320, 240, 640, 480)
-    _is(
-        _read(tmp_path / "c.yaml", MESSAGE % "[0.1, 0.01, 0, 0, 0]"),
+    assert_is(
+        read(tmp_path / "c.yaml", MESSAGE % "[0.1, 0.01, 0, 0, 0]"),
         *parameters,
         [0.1, 0.01, 0, 0],
         "fisheye",
     )
-    _is(_read(tmp_path / "c.yaml", MESSAGE % "[0, 0, 0, 0, 0]"), *parameters, [0.0] * 4, "fisheye")
+    assert_is(read(tmp_path / "c.yaml", MESSAGE % "[0, 0, 0, 0, 0]"), *parameters, [0.0] * 4, "fisheye")
     with pytest.raises(ValueError, match=r"distortion: expected 4 coefficients \(fisheye\), got 5"):
-        _read(tmp_path / "c.yaml", MESSAGE % "[0.1, 0.01, 0, 0, 0.2]")
+        read(tmp_path / "c.yaml", MESSAGE % "[0.1, 0.01, 0, 0, 0.2]")
 
 
 @pytest.mark.parametrize(
@@ -536,9 +525,9 @@ def test_one_value_written_in_two_ways_is_taken(tmp_path, more):
 
 def test_what_python_dumps(tmp_path):
     fields = {"K": (500.0, 0, 320.0, 0, 500.0, 240.0, 0, 0, 1), "D": (), "width": 640, "height": 480}
-    _is(_read(tmp_path / "c.yaml", yaml.dump(fields)), 500, 500, 320, 240, 640, 480)
+    assert_is(read(tmp_path / "c.yaml", yaml.dump(fields)), 500, 500, 320, 240, 640, 480)
     with pytest.raises(ValueError, match=r"expected numbers, texts and lists, got another object at line 2$"):
-        _read(tmp_path / "c.yaml", yaml.dump({**fields, "K": np.eye(3)}))
+        read(tmp_path / "c.yaml", yaml.dump({**fields, "K": np.eye(3)}))
 
 
 # what the calibration program of OpenCV 2.4 and 3.0 writes
@@ -582,7 +571,7 @@ Per_View_Reprojection_Errors: !!opencv-matrix
     ],
 )
 def test_keys_in_other_cases_and_what_a_program_records_beside_the_camera(tmp_path, text):
-    _is(_read(tmp_path / "c.yaml", text), 1150, 1150, 640, 360, 1280, 720, [-0.3, 0.1, 0, 0, 0])
+    assert_is(read(tmp_path / "c.yaml", text), 1150, 1150, 640, 360, 1280, 720, [-0.3, 0.1, 0, 0, 0])
 
 
 @pytest.mark.parametrize(
@@ -605,13 +594,13 @@ def test_keys_in_other_cases_and_what_a_program_records_beside_the_camera(tmp_pa
 )
 def test_keys_beside_the_camera_that_may_concern_the_lens_or_the_images_are_refused(tmp_path, more):
     with pytest.raises(ValueError, match=f"unknown key '{more.split(':')[0]}'; expected fx"):
-        _read(tmp_path / "c.yaml", OPENCV_2 + more)
+        read(tmp_path / "c.yaml", OPENCV_2 + more)
 
 
 @pytest.mark.parametrize("key", ["disortion_coefficients", "coeffs", "kc", "D1"])
 def test_a_misspelled_key_of_the_coefficients_is_an_error(tmp_path, key):
     with pytest.raises(ValueError, match="distortion_coefficients: expected a value, got none"):
-        _read(tmp_path / "c.yaml", OPENCV_2.replace("Distortion_Coefficients", key))
+        read(tmp_path / "c.yaml", OPENCV_2.replace("Distortion_Coefficients", key))
 
 
 @pytest.mark.parametrize(
@@ -626,7 +615,7 @@ def test_a_misspelled_key_of_the_coefficients_is_an_error(tmp_path, key):
 )
 def test_binary_files_say_how_to_write_them_as_texts(tmp_path, name, data, words):
     with pytest.raises(ValueError, match=f"{name}: expected a readable camera file, got: .*{words}"):
-        _read(tmp_path / name, data)
+        read(tmp_path / name, data)
 
 
 @pytest.mark.parametrize(
@@ -656,12 +645,12 @@ def test_binary_files_say_how_to_write_them_as_texts(tmp_path, name, data, words
 )
 def test_what_is_not_read_says_what_to_do(tmp_path, name, text, words):
     with pytest.raises(ValueError, match=f"{name}: expected .*{words}"):
-        _read(tmp_path / name, text)
+        read(tmp_path / name, text)
 
 
 def test_a_comment_on_what_is_not_read_is_a_comment(tmp_path):
     text = "# from MappingCoefficients\n{fx: 633, fy: 633, cx: 408, cy: 245, width: 800, height: 480}\n"
-    _is(_read(tmp_path / "c.yaml", text), 633, 633, 408, 245, 800, 480)
+    assert_is(read(tmp_path / "c.yaml", text), 633, 633, 408, 245, 800, 480)
 
 
 @pytest.mark.parametrize(
@@ -676,8 +665,8 @@ def test_a_comment_on_what_is_not_read_is_a_comment(tmp_path):
     ],
 )
 def test_a_camera_matrix_alone_is_read_for_images_of_a_given_size(tmp_path, name, text):
-    camera = _read(tmp_path / name, text, image_size=(480, 800))
-    _is(camera, 633, 633, 408, 245, 800, 480)
+    camera = read(tmp_path / name, text, image_size=(480, 800))
+    assert_is(camera, 633, 633, 408, 245, 800, 480)
     assert camera.remark.endswith(
         "it is a camera matrix alone, which is taken for that of a lens without distortion"
     )
@@ -696,7 +685,7 @@ def test_a_camera_matrix_alone_is_read_for_images_of_a_given_size(tmp_path, name
 @pytest.mark.parametrize("lens", [[], [-0.3, 0.1, 0.001, 0.002], [-0.3, 0.1, 0.001, 0.002, 0.05]])
 def test_a_line_of_numbers_has_the_focal_lengths_the_principal_point_and_the_lens(tmp_path, lens):
     text = " ".join(map(str, [633.0, 632.0, 408.0, 245.0, *lens]))  # of DROID-SLAM
-    _is(_read(tmp_path / "c.txt", text, image_size=(480, 800)), 633, 632, 408, 245, 800, 480, lens)
+    assert_is(read(tmp_path / "c.txt", text, image_size=(480, 800)), 633, 632, 408, 245, 800, 480, lens)
 
 
 @pytest.mark.parametrize(
@@ -724,13 +713,13 @@ def test_a_list_of_both_sides_is_in_the_order_in_which_the_principal_point_is_in
     lens = [-0.3, 0.1, 0.001, 0.002, 0.05]
     fields = {"camera_matrix": MATRIX, "dist_coeff": [lens], **sides}
     expected = (633, 633, 408, 245, 800, 480, lens)
-    _is(_read(tmp_path / "c.json", json.dumps(fields)), *expected)
+    assert_is(read(tmp_path / "c.json", fields), *expected)
     stereo = {"M1": MATRIX, "D1": [lens], "M2": MATRIX, "D2": [lens], **sides}
-    _is(_read(tmp_path / "c.json", json.dumps(stereo)), *expected)
+    assert_is(read(tmp_path / "c.json", stereo), *expected)
     short = {"fx": 633, "fy": 633, "cx": 408, "cy": 245, "distortion": lens, **sides}
-    _is(_read(tmp_path / "c.json", json.dumps(short)), *expected)
+    assert_is(read(tmp_path / "c.json", short), *expected)
     record = {"camera_intrinsic": MATRIX, "camera_dist_coeffs": lens, **sides}  # as of R3LIVE
-    _is(_read(tmp_path / "c.json", json.dumps(record)), *expected)
+    assert_is(read(tmp_path / "c.json", record), *expected)
 
 
 @pytest.mark.parametrize(
@@ -745,7 +734,7 @@ def test_a_list_of_both_sides_is_in_the_order_in_which_the_principal_point_is_in
 )
 def test_other_fields_of_a_record_are_no_size_and_no_lens(tmp_path, field):
     text = json.dumps({"intrinsic": MATRIX, **field})
-    _is(_read(tmp_path / "c.json", text, image_size=(480, 800)), 633, 633, 408, 245, 800, 480)
+    assert_is(read(tmp_path / "c.json", text, image_size=(480, 800)), 633, 633, 408, 245, 800, 480)
 
 
 @pytest.mark.parametrize("matrix", ["intrinsics", "intrinsic_matrix", "Intrinsics"])
@@ -753,8 +742,8 @@ def test_other_fields_of_a_record_are_no_size_and_no_lens(tmp_path, field):
 def test_other_usual_keys_of_matrix_and_coefficients(tmp_path, matrix, lens):
     fields = {matrix: MATRIX, lens: [-0.3, 0.1, 0, 0, 0.05], "resolution": [800, 480]}
     expected = 633, 633, 408, 245, 800, 480, [-0.3, 0.1, 0, 0, 0.05]
-    _is(_read(tmp_path / "c.json", json.dumps(fields)), *expected)
-    _is(_read(tmp_path / "c.json", json.dumps({"a": fields, "b": fields})), *expected)
+    assert_is(read(tmp_path / "c.json", fields), *expected)
+    assert_is(read(tmp_path / "c.json", {"a": fields, "b": fields}), *expected)
 
 
 @pytest.mark.parametrize("rows", [3, 4])
@@ -764,34 +753,32 @@ def test_a_camera_matrix_may_be_padded(tmp_path, rows):  # ScanNet's text, mmdet
     expected, lens = (633, 633, 408, 245, 800, 480), [-0.3, 0.1, 0, 0, 0.05]
     for key in ("K", "camera_intrinsic"):
         fields = {key: padded.tolist(), "D": lens, "width": 800, "height": 480}
-        _is(_read(tmp_path / "c.json", json.dumps(fields)), *expected, lens)
+        assert_is(read(tmp_path / "c.json", fields), *expected, lens)
     np.savetxt(tmp_path / "intrinsic_color.txt", padded)
-    _is(Camera.from_file(tmp_path / "intrinsic_color.txt", image_size=(480, 800)), *expected)
+    assert_is(Camera.from_file(tmp_path / "intrinsic_color.txt", image_size=(480, 800)), *expected)
     np.save(tmp_path / "k.npy", padded)
-    _is(Camera.from_file(tmp_path / "k.npy", image_size=(480, 800)), *expected)
+    assert_is(Camera.from_file(tmp_path / "k.npy", image_size=(480, 800)), *expected)
     fields = {"K": (padded + np.eye(4)[:rows, ::-1]).tolist(), "D": [], "width": 800, "height": 480}
     with pytest.raises(ValueError, match=f"camera_matrix: expected 9 numbers, got {4 * rows}"):
-        _read(tmp_path / "c.json", json.dumps(fields))
+        read(tmp_path / "c.json", fields)
 
 
 def test_keys_with_their_unit(tmp_path):  # of Argoverse 2
     fields = {"fx_px": 633, "fy_px": 633, "cx_px": 408, "cy_px": 245, "width_px": 800, "height_px": 480}
-    camera = _read(
-        tmp_path / "c.json", json.dumps({"sensor_name": "ring_front_center", **fields, "k1": -0.3})
-    )
-    _is(camera, 633, 633, 408, 245, 800, 480, [-0.3, 0, 0, 0, 0])
+    camera = read(tmp_path / "c.json", json.dumps({"sensor_name": "ring_front_center", **fields, "k1": -0.3}))
+    assert_is(camera, 633, 633, 408, 245, 800, 480, [-0.3, 0, 0, 0, 0])
 
 
 def test_a_camera_matrix_by_names(tmp_path):
     named = {"fx": 633, "fy": 633, "cx": 408, "cy": 245}
     fields = {"camera_matrix": named, "distortion": [-0.3, 0.1, 0, 0, 0.05], "width": 800, "height": 480}
-    _is(_read(tmp_path / "c.json", json.dumps(fields)), *named.values(), 800, 480, fields["distortion"])
+    assert_is(read(tmp_path / "c.json", fields), *named.values(), 800, 480, fields["distortion"])
 
 
 def test_a_text_of_keys_without_a_size_is_of_the_images(tmp_path):
     (tmp_path / "c.txt").write_text("fx: 633\nfy: 633\ncx: 408\ncy: 245\n")
     camera = Camera.from_file(tmp_path / "c.txt", image_size=(480, 800))
-    _is(camera, 633, 633, 408, 245, 800, 480)
+    assert_is(camera, 633, 633, 408, 245, 800, 480)
     assert camera.remark == "the file states no size of images; 800 x 480 px are taken"
 
 
@@ -799,19 +786,19 @@ def test_keys_that_differ_in_case_only_are_an_error(tmp_path):
     with pytest.raises(
         ValueError, match="one of K and k, which mean the same, got both; rename one, or leave"
     ):
-        _read(tmp_path / "c.json", json.dumps({"K": MATRIX, "k": [-0.3, 0.1], "p": [0, 0], "D": []}))
+        read(tmp_path / "c.json", {"K": MATRIX, "k": [-0.3, 0.1], "p": [0, 0], "D": []})
 
 
 def test_numpys_file_with_opencvs_roi_or_without_names(tmp_path):
     lens = {"mtx": MATRIX, "dist": [[-0.3, 0.1, 0, 0, 0.05]]}
     np.savez(tmp_path / "c.npz", **lens, newcameramtx=MATRIX, roi=(9, 9, 780, 460))
     camera = Camera.from_file(tmp_path / "c.npz", image_size=(480, 800))
-    _is(camera, 633, 633, 408, 245, 800, 480, [-0.3, 0.1, 0, 0, 0.05])
+    assert_is(camera, 633, 633, 408, 245, 800, 480, [-0.3, 0.1, 0, 0, 0.05])
     np.savez(tmp_path / "c.npz", intrinsics=5.0, resolution=3.0)
     with pytest.raises(ValueError, match="unknown key 'resolution'"):
         Camera.from_file(tmp_path / "c.npz", image_size=(480, 800))
     np.savez(tmp_path / "c.npz", np.zeros(3), **lens)
-    _is(
+    assert_is(
         Camera.from_file(tmp_path / "c.npz", image_size=(480, 800)),
         633,
         633,
@@ -840,12 +827,12 @@ def test_matrices_without_rows_and_other_names_of_coefficients(tmp_path, key):
     entries = np.ravel(MATRIX).tolist()
     fields = {"cameraMatrix": {"data": entries}, "width": 800, "height": 480}
     for value in (lens, [lens], {"data": lens}, str(lens), "-0.3, 0.1, 0.001, 0.002, 0.05"):
-        camera = _read(tmp_path / "c.json", json.dumps({**fields, key: value}))
-        _is(camera, 633, 633, 408, 245, 800, 480, lens)
+        camera = read(tmp_path / "c.json", {**fields, key: value})
+        assert_is(camera, 633, 633, 408, 245, 800, 480, lens)
     with pytest.raises(ValueError, match="coefficients: expected finite numbers, got -0,3"):
-        _read(tmp_path / "c.json", json.dumps({**fields, key: "-0,3 0,1 0,0 0,0"}))
+        read(tmp_path / "c.json", {**fields, key: "-0,3 0,1 0,0 0,0"})
     with pytest.raises(ValueError, match="camera_matrix: expected 9 numbers, got 8"):
-        _read(
+        read(
             tmp_path / "c.json",
             json.dumps({**fields, "cameraMatrix": {"data": entries[:8]}, key: lens}),
         )
@@ -854,21 +841,21 @@ def test_matrices_without_rows_and_other_names_of_coefficients(tmp_path, key):
 def test_names_dates_and_errors_beside_the_focal_lengths_are_ignored(tmp_path):
     fields = {"fx": 633, "fy": 633, "cx": 408, "cy": 245, "width": 800, "height": 480}
     more = {"rms": 0.55, "camera_name": "front", "date": "2026-11-30", "reprojection_error": 0.2, "_note": ""}
-    _is(_read(tmp_path / "c.json", json.dumps({**fields, **more})), 633, 633, 408, 245, 800, 480)
+    assert_is(read(tmp_path / "c.json", {**fields, **more}), 633, 633, 408, 245, 800, 480)
     for key in ("lens_name", "distorsion", "skew", "radial_error"):
         with pytest.raises(ValueError, match=f"unknown key '{key}'"):
-            _read(tmp_path / "c.json", json.dumps({**fields, key: 1}))
+            read(tmp_path / "c.json", {**fields, key: 1})
 
 
 @pytest.mark.parametrize("sides", [[800], [800, 0], [1, 2, 3, 4]])
 def test_a_list_of_other_than_both_sides_is_refused(tmp_path, sides):
     with pytest.raises(ValueError, match="image_size: expected width and height, got"):
-        _read(tmp_path / "c.json", json.dumps({"K": MATRIX, "D": [], "image_size": sides}))
+        read(tmp_path / "c.json", {"K": MATRIX, "D": [], "image_size": sides})
 
 
 def test_a_list_of_cameras_of_another_program_is_named(tmp_path):  # OKVIS
     with pytest.raises(ValueError, match="unknown key 'cameras'; expected fx"):
-        _read(tmp_path / "c.yaml", "cameras:\n - {image_dimension: [752, 480], focal_length: [458, 457]}\n")
+        read(tmp_path / "c.yaml", "cameras:\n - {image_dimension: [752, 480], focal_length: [458, 457]}\n")
 
 
 OST_INI = """# oST version 5.0 parameters
@@ -895,23 +882,23 @@ distortion
 
 def test_four_coefficients_in_the_ini_of_ros_are_those_of_a_fisheye(tmp_path):
     size = (404, 404, 820, 616, 1640, 1232)
-    _is(
-        _read(tmp_path / "ost.txt", OST_INI.format("0.01 -0.03 0.004 -0.0007")),
+    assert_is(
+        read(tmp_path / "ost.txt", OST_INI.format("0.01 -0.03 0.004 -0.0007")),
         *size,
         [0.01, -0.03, 0.004, -0.0007],
         "fisheye",
     )
-    remark = _read(tmp_path / "ost.txt", OST_INI.format("0.01 -0.03 0.004 -0.0007")).remark
+    remark = read(tmp_path / "ost.txt", OST_INI.format("0.01 -0.03 0.004 -0.0007")).remark
     assert remark.endswith("as ROS writes them: if it is a pinhole camera, add a fifth, 0")
     for lens in ([-0.1, 0.01, 0.0004, -0.0007, 0.0], [-0.1, 0.01, 0.0, 0.0], [0.0] * 4):
-        camera = _read(tmp_path / "ost.txt", OST_INI.format(" ".join(map(str, lens))))
-        _is(camera, *size, lens if any(lens) else [])
+        camera = read(tmp_path / "ost.txt", OST_INI.format(" ".join(map(str, lens))))
+        assert_is(camera, *size, lens if any(lens) else [])
         assert camera.remark == ""
 
 
 def test_four_coefficients_without_a_lens_model_are_remarked_on(tmp_path):
     fields = {"K": MATRIX, "D": [[-0.05], [0.01], [-0.008], [0.002]], "width": 816, "height": 490}
-    camera = _read(tmp_path / "c.json", json.dumps(fields))
+    camera = read(tmp_path / "c.json", fields)
     assert camera.remark.endswith(
         "; they are taken as k1 k2 p1 p2 of a pinhole camera: if it is a fisheye, add model: fisheye"
     )
@@ -921,9 +908,9 @@ def test_four_coefficients_without_a_lens_model_are_remarked_on(tmp_path):
         {"D": [-0.05, 0.01, 0, 0]},
         {"D": [-0.05, 0.01, 0.001, 0, 0.1]},
     ):
-        assert _read(tmp_path / "c.json", json.dumps({**fields, **more})).remark == ""
+        assert read(tmp_path / "c.json", {**fields, **more}).remark == ""
     del fields["width"], fields["height"]
-    remark = _read(tmp_path / "c.json", json.dumps(fields), image_size=(490, 816)).remark
+    remark = read(tmp_path / "c.json", fields, image_size=(490, 816)).remark
     assert remark.startswith("the file states no size of images; 816 x 490 px are taken; it states four")
 
 
@@ -933,4 +920,4 @@ def test_four_coefficients_without_a_lens_model_are_remarked_on(tmp_path):
 )
 def test_keys_below_the_cameras_name_are_read(tmp_path, fields):
     text = yaml.safe_dump({"front": {**fields, "width": 640, "height": 480}})
-    _is(_read(tmp_path / "c.yaml", text), 500, 500, 320, 240, 640, 480)
+    assert_is(read(tmp_path / "c.yaml", text), 500, 500, 320, 240, 640, 480)

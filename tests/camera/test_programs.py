@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from lanebev import Camera
+from tests.camera.files import read
 
 MATLAB = {  # of toStruct(cameraParameters), from R2022b on
     "RadialDistortion": [-0.3, 0.1],
@@ -27,24 +28,19 @@ GYROFLOW = {
 }
 
 
-def _read(tmp_path, fields):
-    (tmp_path / "c.json").write_text(json.dumps(fields))
-    return Camera.from_file(tmp_path / "c.json")
-
-
 @pytest.mark.parametrize("fields", [MATLAB, OLDER])
 def test_matlabs_first_pixel_is_at_1_and_its_lens_is_opencvs(tmp_path, fields):
-    camera = _read(tmp_path, fields)
+    camera = read(tmp_path / "c.json", fields)
     assert camera.intrinsics.tolist() == [[900, 0.5, 640], [0, 905, 360], [0, 0, 1]]
     assert camera.distortion.tolist() == pytest.approx([-0.3, 0.1, 0.001, -0.002])
     assert camera.image_size == (720, 1280)
-    three = _read(tmp_path, {**fields, "RadialDistortion": [-0.3, 0.1, 0.02]})
+    three = read(tmp_path / "c.json", {**fields, "RadialDistortion": [-0.3, 0.1, 0.02]})
     assert three.distortion.tolist() == pytest.approx([-0.3, 0.1, 0.001, -0.002, 0.02])
 
 
 def test_matlabs_camera_below_a_name(tmp_path):
-    expected = _read(tmp_path, MATLAB).fingerprint()
-    assert _read(tmp_path, {"cameraParams": MATLAB}).fingerprint() == expected
+    expected = read(tmp_path / "c.json", MATLAB).fingerprint()
+    assert read(tmp_path / "c.json", {"cameraParams": MATLAB}).fingerprint() == expected
 
 
 def test_what_librealsenses_tool_prints(tmp_path):
@@ -61,7 +57,7 @@ def test_what_librealsenses_tool_prints(tmp_path):
 
 def test_matlabs_camera_intrinsics(tmp_path):
     own = {"FocalLength": [900, 905], "PrincipalPoint": [641, 361], "RadialDistortion": [0, 0]}
-    camera = _read(tmp_path, {**MATLAB, **own, "K": None})
+    camera = read(tmp_path / "c.json", {**MATLAB, **own, "K": None})
     assert camera.intrinsics.tolist() == [[900, 0, 640], [0, 905, 360], [0, 0, 1]]
 
 
@@ -86,11 +82,11 @@ def test_a_matrix_under_open3ds_key_beside_a_lens_is_no_open3ds(tmp_path):
 def test_a_lens_profile_of_gyroflow(tmp_path):
     expected = Camera.from_parameters(560, 561, 642, 358, 1280, 720, (0.03, 0.02, -0.01, 0.003), "fisheye")
     for fields in (GYROFLOW, {**GYROFLOW, "distortion_model": "opencv_fisheye", "digital_lens": None}):
-        camera = _read(tmp_path, fields)
+        camera = read(tmp_path / "c.json", fields)
         assert torch.equal(camera.intrinsics, expected.intrinsics)
         assert torch.equal(camera.distortion, expected.distortion)
         assert (camera.model, camera.image_size) == ("fisheye", (720, 1280))
-    assert _read(tmp_path, {**GYROFLOW, "distortion_model": "opencv_standard"}).model == "pinhole"
+    assert read(tmp_path / "c.json", {**GYROFLOW, "distortion_model": "opencv_standard"}).model == "pinhole"
 
 
 @pytest.mark.parametrize(
@@ -109,4 +105,4 @@ def test_a_lens_profile_of_gyroflow(tmp_path):
 )
 def test_what_cannot_be_read_is_one_clear_line(tmp_path, fields, message):
     with pytest.raises(ValueError, match=message):
-        _read(tmp_path, fields)
+        read(tmp_path / "c.json", fields)

@@ -10,6 +10,7 @@ from lanebev.app.fleet.manifest import read_manifest
 from lanebev.app.fleet.plan import settings_fingerprint
 from lanebev.camera.choice import camera_file
 from lanebev.camera.plausibility import camera_remarks
+from tests.camera.files import read, written
 
 P = "{0} 0 640 0 0 {0} 360 0 0 0 1 0"
 
@@ -72,15 +73,9 @@ UNUSUAL = [
 FOCALS = (800, 900, 1000)
 
 
-def _write(tmp_path, text):
-    path = tmp_path / "cameras.yaml"
-    path.write_text(text)
-    return path
-
-
 @pytest.mark.parametrize(("write", "names", "places"), [*USUAL, *UNUSUAL])
 def test_a_camera_is_chosen_by_its_name(tmp_path, write, names, places):
-    path = _write(tmp_path, write(*FOCALS[: len(names)]))
+    path = written(tmp_path / "cameras.yaml", write(*FOCALS[: len(names)]))
     for name, place in zip(names, places, strict=True):
         camera = Camera.from_file(f"{path}#{name}", image_size=(720, 1280))
         assert camera.intrinsics[0].tolist() == [FOCALS[place], 0, 640]
@@ -91,12 +86,12 @@ def test_a_camera_is_chosen_by_its_name(tmp_path, write, names, places):
 
 @pytest.mark.parametrize(("write", "names", "places"), USUAL)
 def test_the_usual_camera_is_taken_and_said(tmp_path, write, names, places):
-    path = _write(tmp_path, write(*FOCALS[: len(names)]))
+    path = written(tmp_path / "cameras.yaml", write(*FOCALS[: len(names)]))
     camera = Camera.from_file(path, image_size=(720, 1280))
     assert camera.intrinsics[0, 0] == FOCALS[places[0]]
     words = f"of which {names[0]} is taken; choose another as FILE#{names[1]}"
     assert [remark for remark in camera_remarks(camera.scaled((360, 640))) if words in remark]
-    same = Camera.from_file(_write(tmp_path, write(*[800] * len(names))), image_size=(720, 1280))
+    same = read(tmp_path / "cameras.yaml", write(*[800] * len(names)), image_size=(720, 1280))
     assert same.remark == ""  # KITTI's four have the same numbers
 
 
@@ -122,14 +117,14 @@ RIGHT.K: !!opencv-matrix {rows: 3, cols: 3, dt: d, data: [457.6, 0, 380.0, 0, 45
 
 def test_a_camera_may_have_a_negative_number(tmp_path):
     text = _colmap(800) + "-1 PINHOLE 1280 720 900 900 640.5 360.5\n"
-    path = _write(tmp_path, text)
+    path = written(tmp_path / "cameras.yaml", text)
     assert Camera.from_file(f"{path}#-1").intrinsics[0, 0] == 900
     with pytest.raises(ValueError, match="expected one camera, got 2: 1, -1; choose one as FILE#1"):
         Camera.from_file(path)
 
 
 def test_orb_slams_stereo_settings_have_the_camera_of_rectified_images_too(tmp_path):
-    path = _write(tmp_path, STEREO)
+    path = written(tmp_path / "cameras.yaml", STEREO)
     taken = Camera.from_file(path)
     assert (float(taken.intrinsics[0, 0]), float(taken.distortion[0])) == (458.7, -0.283)
     assert "the cameras LEFT, RIGHT, Camera, of which LEFT is taken" in taken.remark
@@ -140,16 +135,16 @@ def test_orb_slams_stereo_settings_have_the_camera_of_rectified_images_too(tmp_p
 
 @pytest.mark.parametrize(("write", "names", "places"), UNUSUAL)
 def test_of_cameras_in_no_order_one_must_be_chosen(tmp_path, write, names, places):
-    path = _write(tmp_path, write(*FOCALS))
+    path = written(tmp_path / "cameras.yaml", write(*FOCALS))
     with pytest.raises(ValueError, match=f"expected one camera, got 3: .*; choose one as FILE#{names[0]}$"):
         Camera.from_file(path)
-    assert Camera.from_file(_write(tmp_path, write(800, 800, 800))).intrinsics[0, 0] == 800
+    assert read(tmp_path / "cameras.yaml", write(800, 800, 800)).intrinsics[0, 0] == 800
 
 
 def test_of_more_cameras_than_kittis_one_must_be_chosen(
     tmp_path,
 ):  # Waymo's in KITTI's format: P0 is in front
-    path = _write(tmp_path, _kitti(800, 810, 820, 830, 840))
+    path = written(tmp_path / "cameras.yaml", _kitti(800, 810, 820, 830, 840))
     with pytest.raises(
         ValueError, match="expected one camera, got 5: P2, P3, P0, P1, P4; choose one as FILE#P2"
     ):
@@ -167,9 +162,9 @@ def test_fields_of_a_lens_have_no_camera_of_rectified_images():
 
 def test_a_broken_camera_beside_the_one_that_is_taken_is_another(tmp_path):
     text = _kalibr(800, 900).replace("[900", "[x")
-    assert "cam0 is taken" in Camera.from_file(_write(tmp_path, text)).remark
+    assert "cam0 is taken" in read(tmp_path / "cameras.yaml", text).remark
     with pytest.raises(ValueError, match="intrinsics: expected finite numbers"):
-        Camera.from_file(f"{_write(tmp_path, text)}#cam1")
+        Camera.from_file(f"{tmp_path}/cameras.yaml#cam1")
 
 
 def test_a_file_of_one_camera_has_no_names(tmp_path):
@@ -181,7 +176,7 @@ def test_a_file_of_one_camera_has_no_names(tmp_path):
 
 
 def test_the_file_is_an_input_whatever_camera_of_it_is_taken(tmp_path):
-    path = _write(tmp_path, _kalibr(*FOCALS))
+    path = written(tmp_path / "cameras.yaml", _kalibr(*FOCALS))
     assert camera_file(f"{path}#cam1") == path
     config = RunConfig(source="drive.mp4", camera=f"{path}#cam1")
     before = settings_fingerprint(config)
@@ -190,7 +185,7 @@ def test_the_file_is_an_input_whatever_camera_of_it_is_taken(tmp_path):
 
 
 def test_drives_of_several_cameras_of_a_file_are_not_those_of_one(tmp_path):
-    _write(tmp_path, _kalibr(*FOCALS))
+    written(tmp_path / "cameras.yaml", _kalibr(*FOCALS))
     drives = "video,camera\na.mp4,cameras.yaml#cam0\nb.mp4,cameras.yaml#cam1\n"
     (tmp_path / "drives.csv").write_text(drives)
     manifest = read_manifest(tmp_path / "drives.csv")
@@ -205,12 +200,12 @@ MESSAGE = (
 def test_messages_of_one_camera_that_were_printed_one_after_another(tmp_path):
     text = "".join(MESSAGE.format(800, stamp) for stamp in range(3))
     for cut in (text, text[:-20], text[: len(text) // 2 - 30]):
-        camera = Camera.from_file(_write(tmp_path, cut))
+        camera = read(tmp_path / "cameras.yaml", cut)
         assert (float(camera.intrinsics[0, 0]), camera.remark) == (800, "")
 
 
 def test_messages_of_two_cameras_that_were_printed_one_after_another(tmp_path):
-    path = _write(tmp_path, MESSAGE.format(800, 1) + MESSAGE.format(900, 2))
+    path = written(tmp_path / "cameras.yaml", MESSAGE.format(800, 1) + MESSAGE.format(900, 2))
     camera = Camera.from_file(path)
     assert camera.intrinsics[0, 0] == 800
     assert camera.remark == "the file has the cameras 1, 2, of which 1 is taken; choose another as FILE#2"
@@ -221,10 +216,11 @@ def test_messages_of_two_cameras_that_were_printed_one_after_another(tmp_path):
     "more", [MESSAGE.format(900, 2)[:60], "a: 1\na: 2", "? [1]\n: 2", "note: it is rectified"]
 )
 def test_a_second_document_that_is_no_camera_does_not_count(tmp_path, more):
-    camera = Camera.from_file(_write(tmp_path, f"{MESSAGE.format(800, 1)}{more}\n"))
+    path = written(tmp_path / "cameras.yaml", f"{MESSAGE.format(800, 1)}{more}\n")
+    camera = Camera.from_file(path)
     assert (float(camera.intrinsics[0, 0]), camera.remark) == (800, "")
     with pytest.raises(ValueError, match=r"expected no name after # for a file of one camera, got '2'$"):
-        Camera.from_file(f"{_write(tmp_path, f'{MESSAGE.format(800, 1)}{more}')}#2")
+        Camera.from_file(f"{path}#2")
 
 
 def test_keys_that_are_indented_in_several_ways_are_named(tmp_path):
@@ -232,14 +228,14 @@ def test_keys_that_are_indented_in_several_ways_are_named(tmp_path):
     with pytest.raises(
         ValueError, match=r"expected all keys in one block, equally indented, got more .* line 2$"
     ):
-        Camera.from_file(_write(tmp_path, text))
+        read(tmp_path / "cameras.yaml", text)
 
 
 @pytest.mark.parametrize("more", ["distortion: [-0.3, 0.1, 0, 0, 0]", "model: fisheye", "{fx: 900}"])
 def test_keys_after_the_braces_are_not_left_out(tmp_path, more):
     text = f"{{fx: 800, fy: 800, cx: 640, cy: 360, width: 1280, height: 720}}\n{more}\n"
     with pytest.raises(ValueError, match=r"expected all keys in the braces, got more after them at line 2$"):
-        Camera.from_file(_write(tmp_path, text))
+        read(tmp_path / "cameras.yaml", text)
 
 
 def _opencv(extra, distortion="[0.1, 0.01, 0.001, 0.002]"):
@@ -259,12 +255,12 @@ def _opencv(extra, distortion="[0.1, 0.01, 0.001, 0.002]"):
 )
 def test_models_that_contradict_each_other_are_refused(tmp_path, extra, words):
     with pytest.raises(ValueError, match=f"model: expected one, got {words}; keep the right one$"):
-        Camera.from_file(_write(tmp_path, _opencv(extra)))
+        read(tmp_path / "cameras.yaml", _opencv(extra))
 
 
 def test_a_pinhole_may_have_the_distortion_of_a_fisheye_as_kalibr_has_it(tmp_path):
     text = _opencv("distortion_model: equidistant\ncamera_model: pinhole")
-    assert Camera.from_file(_write(tmp_path, text)).model == "fisheye"
+    assert read(tmp_path / "cameras.yaml", text).model == "fisheye"
 
 
 @pytest.mark.parametrize(
@@ -276,5 +272,5 @@ def test_a_pinhole_may_have_the_distortion_of_a_fisheye_as_kalibr_has_it(tmp_pat
     ],
 )
 def test_coefficients_that_differ_in_zeros_at_their_end_are_the_same(tmp_path, one, other, expected):
-    camera = Camera.from_file(_write(tmp_path, _opencv(f"D: {other}", one)))
+    camera = read(tmp_path / "cameras.yaml", _opencv(f"D: {other}", one))
     assert camera.distortion.tolist() == expected
