@@ -8,9 +8,10 @@ import torch
 
 from lanebev import BEVGrid, BEVWarp, Camera, Extrinsics
 from lanebev.view.frame import remap_frame
+from tests.view.cameras import LENSES, pose
 
 GRID = BEVGrid(x=(-6.0, 6.0), z=(3.0, 27.0), resolution=0.1)
-POSE = Extrinsics.unstack(torch.tensor([[0.03, 0.02, -0.05, 1.4]], dtype=torch.float64))
+POSE = pose([0.03, 0.02, -0.05, 1.4])
 
 
 def camera(distortion=(), model="pinhole"):
@@ -23,19 +24,7 @@ def frame():
     return np.stack(channels, -1).round().astype(np.uint8)
 
 
-@pytest.mark.parametrize(
-    ("distortion", "model"),
-    [
-        ((), "pinhole"),
-        ((-0.2, 0.03, 0.001, -0.001), "pinhole"),
-        ((-0.2, 0.03, 0.001, -0.001, 0.01), "pinhole"),
-        ((-0.2, 0.03, 0.001, -0.001, 0.01, 0.1, 0.05, 0.01), "pinhole"),
-        ((-0.2, 0.03, 0.001, -0.001, 0.01, 0.1, 0.05, 0.01, 1e-3, 1e-4, -1e-3, 2e-4), "pinhole"),
-        ((-0.2, 0.03, 1e-3, -1e-3, 0.01, 0.1, 0.05, 0.01, 0.0, 0.0, 0.0, 0.0, 0.02, -0.01), "pinhole"),
-        ((0.9, -0.2, 0.03, 0.001, -0.001), "omni"),
-        ((-0.05, 0.01, -0.003, 0.001), "fisheye"),
-    ],
-)
+@pytest.mark.parametrize(("distortion", "model"), LENSES)
 def test_equals_the_module(distortion, model):
     cam, image = camera(distortion, model), frame()
     bev, valid = remap_frame(image, cam, POSE, GRID)
@@ -56,7 +45,7 @@ def test_equals_the_module(distortion, model):
 def test_what_is_behind_or_beyond_a_fold_is_not_seen(values):
     """Nor anything by a camera that is not above the road."""
     grid = BEVGrid(x=(-6.0, 6.0), z=(-8.0, 20.0), resolution=0.1)
-    extrinsics = Extrinsics.unstack(torch.tensor([values], dtype=torch.float64))
+    extrinsics = pose(values)
     for distortion in ((), (-0.3, 0.05, 0.001, -0.001), (-0.3, 0.05, 0.001, -0.001, 0.01)):
         cam = Camera.from_parameters(150.0, 155.0, 160.0, 90.0, 320, 180, distortion)
         bev, valid = remap_frame(frame(), cam, extrinsics, grid)

@@ -4,23 +4,17 @@ import pytest
 import torch
 from kornia.geometry.transform import warp_perspective
 
-from lanebev import BEVGrid, BEVWarp, Camera, Extrinsics
+from lanebev import BEVGrid, BEVWarp, Camera
 from lanebev.geometry.rotation import road_from_cam
 from lanebev.view.canonical import CanonicalView
 from lanebev.view.matrices import ego_from_camera, ego_from_road, image_from_ego, lift_splat_inputs
 from lanebev.view.paint import ImageFromBEV
+from tests.view.cameras import CAMERA, GRID, LENS, has_gradient, pose
 
-GRID = BEVGrid(x=(-4.0, 4.0), z=(5.0, 25.0), resolution=0.1)
-CAMERA = Camera.from_parameters(300.0, 300.0, 160.0, 90.0, 320, 180)
-LENS = Camera.from_parameters(300.0, 300.0, 160.0, 90.0, 320, 180, [-0.2, 0.03, 0.001, -0.001, 0.0])
 FISHEYE = Camera.from_parameters(
     200.0, 200.0, 160.0, 90.0, 320, 180, [-0.02, 0.01, 0.0, 0.0], model="fisheye"
 )
 K = CAMERA.intrinsics[None]
-
-
-def pose(*rows, dtype=torch.float64):
-    return Extrinsics.unstack(torch.tensor(rows, dtype=dtype))
 
 
 def ramp(height=180, width=320, batch=1):
@@ -149,15 +143,13 @@ def test_a_camera_below_the_plane_sees_nothing_of_it(camera):
 def test_painting_has_the_gradient_of_finite_differences():
     grid, size = BEVGrid(x=(-2.0, 2.0), z=(6.0, 12.0), resolution=1.0), (6, 8)
     small = torch.tensor([[[20.0, 0.0, 4.0], [0.0, 20.0, 1.0], [0.0, 0.0, 1.0]]], dtype=torch.float64)
-    generator = torch.Generator().manual_seed(0)
-    bev = torch.rand(1, 1, 6, 4, generator=generator, dtype=torch.float64, requires_grad=True)
-    values = torch.tensor([[0.113, 0.021, -0.017, 1.43]], dtype=torch.float64, requires_grad=True)
 
-    def forward(b, p):
-        return ImageFromBEV(grid)(b, small, Extrinsics.unstack(p), size)[0]
+    def view(b, p):
+        return ImageFromBEV(grid)(b, small, p, size)[0]
 
-    assert forward(bev, values).count_nonzero() > 5
-    assert torch.autograd.gradcheck(forward, (bev, values), atol=1e-6)
+    values = [0.113, 0.021, -0.017, 1.43]
+    assert view(torch.ones(1, 1, 6, 4, dtype=torch.float64), pose(values)).count_nonzero() > 5
+    assert has_gradient(view, (1, 1, 6, 4), values)
 
 
 VIRTUAL = torch.tensor([[250.0, 0.0, 150.0], [0.0, 250.0, 60.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
@@ -208,15 +200,8 @@ def test_the_horizon_stays_and_what_is_above_it_is_turned_only():
 def test_gradients_of_the_canonical_view_are_those_of_finite_differences():
     small = torch.tensor([[[8.0, 0.0, 4.0], [0.0, 8.0, 2.0], [0.0, 0.0, 1.0]]], dtype=torch.float64)
     view = CanonicalView(small[0], (5, 8), pose([0.02, 0.01, -0.02, 1.5]))
-    generator = torch.Generator().manual_seed(0)
-    image = torch.rand(1, 1, 6, 9, generator=generator, dtype=torch.float64, requires_grad=True)
-    values = torch.tensor([[0.113, 0.021, -0.017, 1.43]], dtype=torch.float64, requires_grad=True)
-    lens = torch.tensor([[-0.1, 0.01, 0.001, 0.001]], dtype=torch.float64, requires_grad=True)
-
-    def forward(i, p, d):
-        return view(i, small, Extrinsics.unstack(p), d)[0]
-
-    assert torch.autograd.gradcheck(forward, (image, values, lens), atol=1e-6)
+    values, lens = [0.113, 0.021, -0.017, 1.43], [-0.1, 0.01, 0.001, 0.001]
+    assert has_gradient(lambda i, p, d: view(i, small, p, d)[0], (1, 1, 6, 9), values, [lens])
 
 
 def test_canonical_views_are_checked():
