@@ -21,6 +21,7 @@ from lanebev.io.results import CSV_COLUMNS, ExtrinsicsRow, write_extrinsics
 from lanebev.io.state import load_state
 from tests.app.straight_road import CAMERA, FRAMES, POSE, ROWS, lane_lines, run, table
 from tests.drawn_road import PLACES, boundary
+from tests.io.video.damaged import packets_of
 from tools import pseudo_ground_truth
 
 
@@ -227,9 +228,8 @@ def test_frames_without_lanes_are_rows(data, tmp_path):
 
 @pytest.mark.slow
 def test_a_cut_video_is_reported_and_takes_its_own_lanes(data, tmp_path, capsys):
-    with av.open(str(data / "drive.mp4")) as container:
-        end = [packet.pos + packet.size for packet in container.demux(video=0) if packet.size][3]
-    (tmp_path / "drive.mp4").write_bytes((data / "drive.mp4").read_bytes()[: end + 50])
+    packet = packets_of(data / "drive.mp4")[3]
+    (tmp_path / "drive.mp4").write_bytes((data / "drive.mp4").read_bytes()[: packet.pos + packet.size + 50])
     shutil.copy(data / "camera.yaml", tmp_path)
     lines = (data / "video_lanes.json").read_text().splitlines()
     (tmp_path / "lanes.json").write_text("\n".join(lines[:5]))

@@ -19,9 +19,9 @@ LENSES = [  # distortion and model of every kind
 ]
 
 
-def pose(*rows):
+def pose(*rows, dtype=torch.float64):
     """Extrinsics of rows of pitch, yaw, roll, height."""
-    return Extrinsics.unstack(torch.tensor(rows, dtype=torch.float64))
+    return Extrinsics.unstack(torch.tensor(rows, dtype=dtype))
 
 
 def has_gradient(view, shape, values, lens=()):

@@ -1,4 +1,4 @@
-"""A damaged video."""
+"""Damaged videos."""
 
 import av
 import numpy as np
@@ -14,13 +14,21 @@ def write_damaged(path, spoilt, count=16, **options):
             image = noise.integers(0, 255, (48, 64, 3), dtype=np.uint8)
             container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
         container.mux(stream.encode())
+    packets = packets_of(path)
+    order = sorted(packet.pts for packet in packets)
+    for packet in (packets[i] for i in spoilt):
+        overwrite(path, packet.pos, b"\xff" * packet.size)
+    return sorted(order.index(packets[i].pts) for i in spoilt)
+
+
+def packets_of(path):
+    """A video's packets, in the order of the file."""
     with av.open(str(path)) as container:
-        packets = [packet for packet in container.demux(video=0) if packet.size]
-        places = [(packets[i].pos, packets[i].size) for i in spoilt]
-        order = sorted(packet.pts for packet in packets)
-        numbers = [order.index(packets[i].pts) for i in spoilt]
-    data = bytearray(path.read_bytes())
-    for start, size in places:
-        data[start : start + size] = b"\xff" * size
-    path.write_bytes(data)
-    return sorted(numbers)
+        return [packet for packet in container.demux(video=0) if packet.size]
+
+
+def overwrite(path, place, junk):
+    """Put bytes in the place of a file's own."""
+    with path.open("r+b") as file:
+        file.seek(place)
+        file.write(junk)

@@ -16,6 +16,7 @@ from lanebev.io.opening import open_source
 from lanebev.io.video.decoding import decoded, displayed, packets
 from lanebev.io.video.remarks import missing_remark
 from lanebev.io.video.writer import VideoWriter
+from tests.io.video.damaged import overwrite, packets_of
 
 SIZE = (48, 64)
 
@@ -89,16 +90,14 @@ def _noise(count=12):
     return noise.integers(0, 255, (count, *SIZE, 3), dtype=np.uint8)
 
 
+def _damage_the_fourth(path):
+    packet = packets_of(path)[3]
+    overwrite(path, packet.pos + 8 + packet.size // 2, bytes(40))  # 8: AVI's chunk header
+
+
 def test_a_frame_that_the_decoder_marks_as_damaged_is_a_frame_without_image(tmp_path):
     path = _encode(tmp_path / "v.avi", "mpeg4", images=_noise(), count=12, g="100", sc_threshold="1000000000")
-    with av.open(str(path)) as container:
-        packets = [packet for packet in container.demux(video=0) if packet.size]
-        place = packets[3].pos + 8  # AVI's chunk header
-        size = packets[3].size
-    data = bytearray(path.read_bytes())
-    middle = place + size // 2
-    data[middle : middle + 40] = b"\x00" * 40
-    path.write_bytes(data)
+    _damage_the_fourth(path)
     with av.open(str(path)) as container:
         marked = [frame.is_corrupt for frame in container.decode(video=0)]
     assert marked == [i == 3 for i in range(12)]  # concealed, and marked
@@ -114,12 +113,7 @@ def test_a_frame_that_the_decoder_marks_as_damaged_is_a_frame_without_image(tmp_
 
 def test_damage_ends_at_the_next_key_frame(tmp_path):
     path = _encode(tmp_path / "v.avi", "mpeg4", images=_noise(), count=12, g="4", sc_threshold="1000000000")
-    with av.open(str(path)) as container:
-        packets = [packet for packet in container.demux(video=0) if packet.size]
-        place, size = packets[3].pos + 8, packets[3].size
-    data = bytearray(path.read_bytes())
-    data[place + size // 2 : place + size // 2 + 40] = b"\x00" * 40
-    path.write_bytes(data)
+    _damage_the_fourth(path)
     frames = list(open_source(str(path)))
     assert [frame.number for frame in frames if frame.problem] == [3]
 
@@ -137,12 +131,8 @@ def test_damage_ends_at_the_next_key_frame(tmp_path):
 )
 def test_damage_that_decoders_do_not_mark_by_themselves_is_noticed(tmp_path, codec, suffix, share, options):
     path = _encode(tmp_path / f"v.{suffix}", codec, images=_noise(), count=12, g="100", **options)
-    with av.open(str(path)) as container:
-        packets = [packet for packet in container.demux(video=0) if packet.size]
-        place = packets[3].pos + 6 + round(share * packets[3].size)  # 6: length and header of HEVC's
-    data = bytearray(path.read_bytes())
-    data[place : place + 200] = b"\xff" * 200
-    path.write_bytes(data)
+    packet = packets_of(path)[3]
+    overwrite(path, packet.pos + 6 + round(share * packet.size), b"\xff" * 200)  # 6: HEVC's length and header
     frames = list(open_source(str(path)))
     assert all(frame.image is not None for frame in frames[:3])
     assert frames[3].image is None
@@ -154,9 +144,7 @@ def test_packets_that_a_transport_stream_lost_are_noticed(tmp_path):
     path = _encode(tmp_path / "v.ts", images=_noise(30), count=30, g="15", bf="0", sc_threshold="0")
     whole = list(open_source(str(path)))
     assert not any(frame.problem for frame in whole)
-    with av.open(str(path)) as container:
-        place = [packet.pos for packet in container.demux(video=0) if packet.size][5]
-    data = path.read_bytes()
+    place, data = packets_of(path)[5].pos, path.read_bytes()
     path.write_bytes(data[: place + 188] + data[place + 4 * 188 :])  # of 188 bytes each
     source = open_source(str(path))
     problems = {round(10 * frame.time): frame.problem for frame in source if frame.problem}
@@ -191,10 +179,8 @@ def test_a_frame_in_a_packet_that_the_container_marks_is_lost(tmp_path, monkeypa
 
 def test_frames_that_a_transport_stream_lost_as_a_whole_are_counted(tmp_path):
     path = _encode(tmp_path / "v.ts", images=_noise(30), count=30, g="15", bf="0")
-    with av.open(str(path)) as container:
-        places = [packet.pos for packet in container.demux(video=0) if packet.size]
-    data = path.read_bytes()
-    path.write_bytes(data[: places[5]] + data[places[7] :])
+    found, data = packets_of(path), path.read_bytes()
+    path.write_bytes(data[: found[5].pos] + data[found[7].pos :])
     problem = open_source(str(path)).problem
     assert (
         "its times leave out 2 frames; if they were lost, images after such a gap may be damaged" in problem
