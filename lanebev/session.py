@@ -22,6 +22,7 @@ from lanebev.estimation.mount import MountCalibration, describe_mount
 from lanebev.estimation.reasons import Reason, describe_reasons
 from lanebev.estimation.tracker import Tracker
 from lanebev.io.frame_clock import FrameClock
+from lanebev.io.frozen_images import STRIDE, ImageChanges
 from lanebev.io.lanes.doubts import LaneDoubts
 from lanebev.io.lanes.parsing import FrameLines
 from lanebev.io.speeds import fast_remark
@@ -139,7 +140,7 @@ class Session:
         """Forget the drive and the mount, as if the session were new."""
         self.tracker: Tracker[Any] = self._new_tracker()
         self._clock = FrameClock()
-        self._lanes = LaneDoubts(self.camera)
+        self._lanes, self._images = LaneDoubts(self.camera), ImageChanges()
 
     def __call__(
         self,
@@ -174,6 +175,7 @@ class Session:
         dt, remarks = self._clock.step(stamp)
         fast = fast_remark(speed or 0.0, "divide it by 3.6")
         lost = "no frame was given" if frame is None and polylines is None else ""
+        self._images.add(None if pixels is None else image_bytes(pixels[:, ::STRIDE, ::STRIDE]))
         with torch.inference_mode():
             vertices, scale = self._vertices(pixels, polylines)
             _, calibration, reasons, vertical_curvature = self.tracker.drive_frame(vertices, dt, scale, speed)
@@ -193,7 +195,7 @@ class Session:
             std=Extrinsics.unstack(std),
             status=Status(int(calibration.status[0])),
             reasons=[
-                *filter(None, (*remarks, lost, fast, self._lanes.doubt)),
+                *filter(None, (*remarks, lost, fast, self._lanes.doubt, self._images.remark())),
                 *describe_reasons(reasons & ~Reason.TIME if remarks else reasons),
             ],
             mount=mounted,
@@ -230,7 +232,7 @@ class Session:
         fresh.state, fresh.mount_state = loaded.states["calibrator"], loaded.states["mount"]
         self.tracker = fresh
         self._clock = FrameClock(**(loaded.metadata.get("clock") or {}))
-        self._lanes = LaneDoubts(self.camera)
+        self._lanes, self._images = LaneDoubts(self.camera), ImageChanges()
 
     def _rgb(self, frame: NDArray[np.uint8] | Tensor) -> Tensor:
         """Check a frame and return it as (3, H, W) RGB."""

@@ -123,6 +123,37 @@ def test_polylines_of_different_lanes_are_noticed():
     assert "one lane is 2.7 times as wide as another" in remark  # 2.5, and some roll
 
 
+def test_polylines_that_are_given_again_or_skip_a_number_are_noticed():
+    """A slow detector's lines in each frame of the camera; classes as numbers, which doubled the height."""
+    rng = np.random.default_rng(0)
+    noisy = [[line + rng.normal(0, 0.3, line.shape) for line in map(np.asarray, lines())] for _ in range(20)]
+    for repeats, numbers, said in (
+        (1, (1, 2, 3, 4), ""),
+        (3, (1, 2, 3, 4), "lanes: 13 of 20 frames have the lines of the frame before, to the last digit"),
+        (1, (0, 2, 4), "lanes: no frame has boundary 1, so that 0 and 2 are taken to have 2 lanes"),
+    ):
+        session = Session(CAMERA)
+        for k in range(20):
+            drawn = dict(zip(numbers, noisy[k // repeats], strict=False))
+            result = session(polylines=drawn, stamp=k / 20)
+        remarks = [text for text in result.reasons if text.startswith("lanes: ")]
+        assert len(remarks) == bool(said)
+        assert all(text.startswith(said) for text in remarks)
+
+
+def test_a_frozen_camera_is_noticed():
+    rng = np.random.default_rng(0)
+    session = Session(CAMERA)
+    images = rng.integers(0, 255, (16, 360, 640, 3), np.uint8)
+    for k in range(30):
+        reasons = session(images[min(k, 15)], k / 20, polylines=lines()).reasons
+        frozen = [text for text in reasons if "show the same image: is the camera frozen?" in text]
+        assert len(frozen) == (k >= 25), k
+    assert frozen[0].startswith("the last 15 frames show")
+    reasons = session(torch.rand(3, 360, 640), 2.0, polylines=lines()).reasons
+    assert not any("frozen" in text for text in reasons)
+
+
 def test_a_saved_session_goes_on_exactly(tmp_path):
     one, other = Session(CAMERA), Session(CAMERA)
     for k in range(6):

@@ -3,19 +3,17 @@
 Their errors are those of the frame before. The motion stops in them and is twice as large in the next frame.
 """
 
-import math
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lanebev.app.recording.storage import StoredNumbers
+from lanebev.io.frozen_images import FROZEN, STRIDE, ImageChanges
 
-_STRIDE = 8  # px, of the pixels that are compared
 _NEAR = 2  # frames before and after, among which the largest change is that of the drive
 _MOVING = 1.0  # grey levels of 255 on average, of a change that counts
 _REPEATED = 0.2  # a frame repeats if it changes by less of the largest change near by; codecs cause 0.1
-_FROZEN = 0.05  # grey levels on average, of a change that no camera's noise leaves
 _MOST_SHARE, _MOST_COUNT = 0.1, 4  # fraction and number of frames; more repeated frames are reported
 
 
@@ -42,24 +40,20 @@ class RepeatedFrames:
     """
 
     def __init__(self, folder: Path | None = None) -> None:
-        self._before: NDArray[np.int16] | None = None
-        self._changes = StoredNumbers(folder=folder)
+        self._between, self._changes = ImageChanges(), StoredNumbers(folder=folder)
 
     def add(self, image: NDArray[np.uint8] | None) -> None:
         """Take the next frame (H, W, 3), None if it was lost."""
-        seen = None if image is None else image[::_STRIDE, ::_STRIDE].astype(np.int16)
-        change = math.nan
-        if seen is not None and self._before is not None:
-            change = float(np.abs(seen - self._before).mean())
-        self._changes.append(np.array(change))
-        self._before = seen
+        self._changes.append(
+            np.array(self._between.add(None if image is None else image[::STRIDE, ::STRIDE]))
+        )
 
     def remark(self) -> str:
         """Return a remark on the drive; empty if few frames are repeated."""
         changes = self._changes.all()
         count = int(repeated(changes).sum()) if len(changes) else 0
         many = max(_MOST_COUNT, _MOST_SHARE * len(changes))
-        frozen = int((changes < _FROZEN).sum())
+        frozen = int((changes < FROZEN).sum())
         if count <= many < frozen:
             return (
                 f"{frozen} of {len(changes)} frames show the image of the one before: is the video frozen?"

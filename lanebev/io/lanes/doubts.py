@@ -7,7 +7,12 @@ from torch import Tensor
 from lanebev.camera.model import Camera
 from lanebev.io.lanes.contrast import LaneContrast
 from lanebev.io.lanes.parsing import FrameLines
-from lanebev.io.lanes.remarks import unequal_lanes_remark
+from lanebev.io.lanes.remarks import (
+    boundary_numbers,
+    left_out_words,
+    repeats_remark,
+    unequal_lanes_remark,
+)
 from lanebev.io.lanes.size import size_doubt
 from lanebev.observation.frames import image_bytes
 
@@ -18,7 +23,9 @@ logger = logging.getLogger(__name__)
 
 
 class LaneDoubts:
-    """Notices polylines of other images, or of unequal lanes; logs it once, as long as it lasts.
+    """Notices polylines of other images, of unequal lanes, with a number left out, or given again.
+
+    It is logged once, as long as it lasts.
 
     Attributes:
         doubt: the doubt about the last frames that were judged, or about the contrast in one of each
@@ -30,6 +37,7 @@ class LaneDoubts:
         self._camera = camera
         self._drawn: list[FrameLines] = []
         self._contrast, self._judged = LaneContrast(), 0
+        self._numbers: set[int] = set()
 
     def add(self, lines: FrameLines, image: Tensor | None = None) -> None:
         """Take the polylines of one frame (3, H, W), and judge all since the last time if they are enough."""
@@ -43,7 +51,13 @@ class LaneDoubts:
         found = size_doubt(self._drawn, self._camera.image_size)
         of_images = found.words if found else self._contrast.remark()
         words = f"polylines: {of_images} {_REMEDY}" if of_images else ""
-        words = words or unequal_lanes_remark(self._drawn, self._camera)
+        self._numbers |= boundary_numbers(self._drawn)
+        words = (
+            words
+            or unequal_lanes_remark(self._drawn, self._camera)
+            or left_out_words(self._numbers)
+            or repeats_remark(self._drawn)
+        )
         if words and not self.doubt:
             logger.warning(words)
         self.doubt, self._drawn = words, []

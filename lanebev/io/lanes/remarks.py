@@ -43,8 +43,17 @@ def left_out_remark(frames: Sequence[FrameLines]) -> str:
     """
     if sum(bool(frame.lines) for frame in frames) < _LEAST_FRAMES:
         return ""
-    numbers = sorted({line.boundary for frame in frames for line in frame.lines if line.boundary is not None})
-    skipping = [(left, right) for left, right in pairwise(numbers) if right > left + 1]
+    return left_out_words(boundary_numbers(frames))
+
+
+def boundary_numbers(frames: Sequence[FrameLines]) -> set[int]:
+    """Return the boundary numbers that the lines of frames state."""
+    return {line.boundary for frame in frames for line in frame.lines if line.boundary is not None}
+
+
+def left_out_words(numbers: set[int]) -> str:
+    """Return which number is left out between two boundary numbers; else nothing."""
+    skipping = [(left, right) for left, right in pairwise(sorted(numbers)) if right > left + 1]
     if not skipping:
         return ""
     left, right = skipping[0]
