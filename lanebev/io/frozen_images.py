@@ -1,6 +1,7 @@
 """Notice a camera that gives the same image again and again."""
 
 import math
+from collections import deque
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +12,7 @@ FROZEN = 0.05
 STRIDE = 8
 """px, of the pixels of a frame that are compared."""
 
-_LEAST = 10  # frames; a slow camera gives an image a few times
+_LOOKED_AT, _MOST = 20, 6  # latest frames, and how many of them may show the image of the one before
 
 
 class ImageChanges:
@@ -19,7 +20,7 @@ class ImageChanges:
 
     def __init__(self) -> None:
         self._before: NDArray[np.int16] | None = None
-        self._same = 0
+        self._same: deque[bool] = deque(maxlen=_LOOKED_AT)
 
     def add(self, image: NDArray[np.uint8] | None) -> float:
         """Take each STRIDE-th pixel of the next frame, (h, w, 3); None if it was lost.
@@ -32,14 +33,14 @@ class ImageChanges:
         if seen is not None and self._before is not None:
             change = float(np.abs(seen - self._before).mean())
         self._before = seen
-        self._same = self._same + 1 if change < FROZEN else 0
+        self._same.append(change < FROZEN)
         return change
 
     def remark(self) -> str:
-        """Return a remark if many frames up to the last one show the same image; else nothing."""
-        if self._same < _LEAST:
+        """Return a remark if many of the latest frames show the image of the one before; else nothing."""
+        if (count := sum(self._same)) <= _MOST:
             return ""
         return (
-            f"the last {self._same + 1} frames show the same image: is the camera frozen? standard "
-            "deviations become too small, since the errors are the same"
+            f"{count} of the last {len(self._same)} frames show the image of the one before: is the camera "
+            "frozen, or slower than the calls? standard deviations become too small; give each image once"
         )

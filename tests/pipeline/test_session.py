@@ -141,17 +141,22 @@ def test_polylines_that_are_given_again_or_skip_a_number_are_noticed():
         assert all(text.startswith(said) for text in remarks)
 
 
-def test_a_frozen_camera_is_noticed():
-    rng = np.random.default_rng(0)
-    session = Session(CAMERA)
-    images = rng.integers(0, 255, (16, 360, 640, 3), np.uint8)
-    for k in range(30):
-        reasons = session(images[min(k, 15)], k / 20, polylines=lines()).reasons
-        frozen = [text for text in reasons if "show the same image: is the camera frozen?" in text]
-        assert len(frozen) == (k >= 25), k
-    assert frozen[0].startswith("the last 15 frames show")
-    reasons = session(torch.rand(3, 360, 640), 2.0, polylines=lines()).reasons
-    assert not any("frozen" in text for text in reasons)
+def test_a_frozen_camera_and_one_that_is_slower_than_the_calls_are_noticed():
+    images = np.random.default_rng(0).integers(0, 255, (40, 360, 640, 3), np.uint8)
+    for shown, first in (
+        (range(40), None),
+        ([*range(16), *[15] * 24], 22),
+        ([k // 3 for k in range(40)], 10),
+    ):
+        session = Session(CAMERA)
+        found = [
+            [text for text in session(images[k], i / 20, polylines=lines()).reasons if "frozen" in text]
+            for i, k in enumerate(shown)
+        ]
+        assert next((i for i, texts in enumerate(found) if texts), None) == first
+    assert found[-1][0].startswith("13 of the last 20 frames show the image of the one before: is the camera")
+    session.reset()
+    assert session(torch.rand(3, 360, 640), 2.0, polylines=lines()).reasons == ["started in this frame"]
 
 
 def test_a_saved_session_goes_on_exactly(tmp_path):
