@@ -86,7 +86,7 @@ _OF_NO_MODEL = (
 _RENAME = "rename it, or leave it out"
 _INSTEAD = {  # of keys in lower case, in place of a focal length in px
     "fov": "give the horizontal field of view by --fov DEGREES or Camera.from_fov, in place of the file",
-    "focal|sensor": "fx is focal length / sensor width (both in mm) times the images' width in px",
+    "focal|sensor_?[wh]": "fx is focal length / sensor width (both in mm) times the images' width in px",
 }
 _OFF_CENTRE = 0.1  # shares of the sides, more than which a file without a size is of other images
 _IDENTITY = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]

@@ -68,11 +68,13 @@ _PLACES = ("calib", "cameras")  # keys below which ONCE and A2D2 have their came
 def record_cameras(content: Any, image_size: tuple[int, int] | None, rectified: bool) -> Readers:
     """Return readers of the cameras of a data set's JSON; none for other files.
 
-    Their names are those of the file, nuScenes' tokens, or their places if these do not tell them apart.
+    Their names are those of the file, in a list their tokens (nuScenes) or ``name``, or their places if these
+    do not tell them apart.
     """
     if isinstance(content, list):
-        records = [each for each in content if isinstance(each, Mapping) and each.get("camera_intrinsic")]
-        named = dict(zip(telling_names([str(each.get("token")) for each in records]), records, strict=True))
+        records = [each for each in content if _layout(each)]
+        names = [str(each.get("token") or each.get("name")) for each in records]
+        named = dict(zip(telling_names(names), records, strict=True))
     elif is_woodscape(content):
         return {"": partial(woodscape, content)}
     elif _layout(content):

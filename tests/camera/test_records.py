@@ -96,6 +96,11 @@ LIKE_OPENLANE = {"intrinsic": _matrix(1000, 960, 540), "width": 1920, "height": 
         (LIKE_OPENLANE, "", (1000, 1002, 960, 540, 1920, 1080, ())),
         ({**LIKE_OPENLANE, "distortion": LENS}, "", (1000, 1002, 960, 540, 1920, 1080, LENS)),
         ({**LIKE_OPENLANE, "k1": -0.3}, "", (1000, 1002, 960, 540, 1920, 1080, (-0.3, 0, 0, 0, 0))),
+        (
+            [{**WAYMO, "name": "REAR", "width": 960}, {**WAYMO, "name": "FRONT"}],
+            "#FRONT",
+            (2059, 2061, 936, 635, 1920, 1280, LENS),
+        ),
         (WAYMO, "", (2059, 2061, 936, 635, 1920, 1280, LENS)),
         ({**NERF, **BY_NAME}, "", (900, 902, 640, 360, 1280, 720, LENS)),
         (
