@@ -31,7 +31,7 @@ def frames_path(out: str | Path, drive: Drive) -> Path:
 
 
 def collect_frames(drives: Sequence[Drive], out: str | Path) -> None:
-    """Update the data set: add finished drives, remove all others.
+    """Update the data set: add finished drives, remove the files of all others.
 
     The columns are those of a run's Parquet file, and ``drive``. A file that is newer than the run stays.
     """
@@ -39,7 +39,7 @@ def collect_frames(drives: Sequence[Drive], out: str | Path) -> None:
     import pyarrow.parquet
 
     wanted = {frames_path(out, drive): drive for drive in drives}
-    for path in (Path(out) / FRAMES).rglob("*.parquet"):
+    for path in (Path(out) / FRAMES).glob("camera=*/day=*/*.parquet"):
         if path not in wanted:
             path.unlink()
     for path, drive in wanted.items():

@@ -20,7 +20,7 @@ from lanebev.app.fleet.collect import FRAMES, collect_frames
 from lanebev.app.fleet.manifest import Drive, read_manifest
 from lanebev.app.fleet.mounts import Stretch, days, drive_mounts, stretches
 from lanebev.app.fleet.page import CameraMounts, fleet_page
-from lanebev.app.fleet.plan import Outcome, Task, drive_folder, earlier_outcome, tasks_of
+from lanebev.app.fleet.plan import DRIVES, Outcome, Task, drive_folder, earlier_outcome, tasks_of
 from lanebev.app.progress import Progress, no_progress
 from lanebev.estimation.mount import MountEstimator, MountState
 from lanebev.io.formats.names import check_installed
@@ -32,6 +32,7 @@ from lanebev.report.verdict import verdict
 from lanebev.types import AXES
 
 logger = logging.getLogger(__name__)
+PAGE = "index.html"
 _MOST_FAILURES = 10  # failures that are printed
 
 
@@ -69,13 +70,19 @@ def fleet(
         progress: wraps the drives that end, given the number that are to be run.
 
     Raises:
-        ValueError: bad manifest, a library that is not installed, or another call at work in this folder.
+        ValueError: bad manifest, a library that is not installed, another call at work in this folder, or an
+            index page in it that no fleet wrote.
     """
     check_ray()
     check_installed(["parquet"])
     drives = read_manifest(manifest, root)
     tasks = tasks_of(drives, out, None if part_minutes is None else 60 * part_minutes)
     folder = Path(out)
+    if (folder / PAGE).exists() and not (folder / DRIVES).is_dir():
+        raise ValueError(
+            f"output folder {out}: expected a new one or an earlier fleet's, got one with a file {PAGE} and "
+            f"no folder {DRIVES}; give another with --out"
+        )
     try:
         folder.mkdir(parents=True, exist_ok=True)
         lock = FolderLock(folder / ".fleet")
@@ -101,7 +108,7 @@ def fleet(
             )
             for drive in done
         }
-        with whole_file(folder / "index.html") as path:
+        with whole_file(folder / PAGE) as path:
             page = fleet_page(folder.resolve().name, drives, found, verdicts, cameras)
             path.write_text(page, encoding="utf-8", errors="replace")
     finally:
@@ -194,4 +201,4 @@ def _summary(found: dict[str, Outcome], ran: int, out: str) -> str:
     lines += [f"failed: {outcome.name}: {outcome.failure}" for outcome in failed[:_MOST_FAILURES]]
     if len(failed) > _MOST_FAILURES:
         lines.append(f"and {len(failed) - _MOST_FAILURES} more, see the page")
-    return "\n".join([*lines, f"{out}: index.html, mounts.json, {FRAMES}/, drives/"])
+    return "\n".join([*lines, f"{out}: {PAGE}, mounts.json, {FRAMES}/, {DRIVES}/"])

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from lanebev.app.config import BACKENDS, RunConfig
-from lanebev.app.fleet.fleet import write_mounts
+from lanebev.app.fleet.collect import collect_frames
+from lanebev.app.fleet.fleet import fleet, write_mounts
 from lanebev.app.fleet.manifest import Drive
 from lanebev.app.fleet.mounts import DriveMount, stretches
 from lanebev.app.fleet.page import CameraMounts, fleet_page
@@ -63,6 +64,26 @@ def test_mounts_are_written_as_json(tmp_path, camera):
     assert found["drives"][1]["roll_deg"] is None
     assert found["drives"][3]["pitch_deg"] == pytest.approx(np.degrees(0.03))
     assert found["drives"][2]["moved"] == ["pitch", "yaw", "roll", "height"]
+
+
+def test_files_that_no_fleet_wrote_stay(tmp_path):  # frames/mine.parquet was deleted
+    pytest.importorskip("ray", reason="Ray is not installed")
+    pytest.importorskip("pyarrow", reason="pyarrow is not installed")
+    mine, former = (
+        tmp_path / "frames" / "mine.parquet",
+        tmp_path / "frames" / "camera=a" / "day=b" / "c.parquet",
+    )
+    former.parent.mkdir(parents=True)
+    for path in (mine, former, tmp_path / "index.html"):
+        path.write_text("mine")
+    collect_frames([], tmp_path)
+    assert (mine.exists(), former.exists()) == (True, False)
+    for name in ("a.mp4", "c.yaml"):
+        (tmp_path / name).write_text("")
+    (tmp_path / "drives.csv").write_text("video,camera\na.mp4,c.yaml\n")
+    with pytest.raises(ValueError, match=r"one with a file index\.html and no folder drives; give another"):
+        fleet(str(tmp_path / "drives.csv"), str(tmp_path))
+    assert (tmp_path / "index.html").read_text() == "mine"
 
 
 def test_what_is_finished_is_known_until_something_changes(tmp_path):
