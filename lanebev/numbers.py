@@ -99,7 +99,7 @@ def check_number(name: str, value: object, expected: str = "a number") -> None:
         raise TypeError(f"{name}: expected {expected}, got {type(value).__qualname__}")
 
 
-def check_settings(config: Any, positive: Collection[str] = (), infinite: Collection[str] = ()) -> None:
+def check_settings(config: Any, positive: Collection[str], infinite: Collection[str]) -> None:
     """Raise unless every number of a dataclass is finite and at least 0.
 
     Args:

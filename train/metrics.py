@@ -18,7 +18,7 @@ Points = npt.NDArray[np.float64]
 _LEAST_MASS = 0.5  # label px, below which a row has no boundary
 
 
-def row_recall(probabilities: Tensor, target: Tensor, tolerance: float = 2.5) -> tuple[Tensor, Tensor]:
+def row_recall(probabilities: Tensor, target: Tensor, tolerance: float) -> tuple[Tensor, Tensor]:
     """Return the rows in which each boundary is found.
 
     A row where a boundary's stripe has its mass is found if at least half of that mass of probability lies

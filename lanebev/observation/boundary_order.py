@@ -65,7 +65,7 @@ def boundary_indices(
 
 
 def width_ratios(
-    lines: Sequence[NDArray[np.float64]], indices: Sequence[int | None], rolls: Sequence[float] = (0.0,)
+    lines: Sequence[NDArray[np.float64]], indices: Sequence[int | None], rolls: Sequence[float]
 ) -> NDArray[np.float64]:
     """Return the ratio of the widest lane to the narrowest one, for every roll that the camera may have.
 

@@ -33,7 +33,7 @@ _LINE, _UNDETERMINED, _TRUTH, _SECOND = "#1f6feb", "#7d8794", "#24292f", "#c2410
 def plot_estimates(
     x: NDArray[np.float64],
     rows: Sequence[ExtrinsicsRow],
-    stills: bool = False,
+    stills: bool,
     truth: Sequence[ExtrinsicsRow] | None = None,
 ) -> dict[str, Any]:
     """Return a plot of pitch, yaw, roll and height with ±2 sigma, grey where they are not determined.

@@ -59,7 +59,7 @@ def cell_sums(
     plane_heights: Sequence[float],
     image_from_cam: Tensor | None,
     extrinsics: Extrinsics,
-    vertical_curvature: Tensor | None = None,
+    vertical_curvature: Tensor | None,
 ) -> CellSums:
     """Compute the homogeneous image coordinates of all cells of all planes.
 

@@ -58,7 +58,7 @@ def make_lens(
     return Lens(distortion, lens_model(model), focal, skew, upper[:, :, 2], limit, tilt)
 
 
-def image_planes(points: Tensor, lens: Lens, continued: bool = False) -> tuple[Tensor, Tensor]:
+def image_planes(points: Tensor, lens: Lens, continued: bool) -> tuple[Tensor, Tensor]:
     """Project points of the ideal z = 1 plane to the image.
 
     Args:

@@ -101,7 +101,7 @@ def image_coordinates(cells: Tensor, lens: Lens | None, continued: bool = False)
     return points, hidden + beyond
 
 
-def outside_image(points: Tensor, hidden: Tensor | None = None) -> Tensor:
+def outside_image(points: Tensor, hidden: Tensor | None) -> Tensor:
     """Mark what an image does not show.
 
     Args:

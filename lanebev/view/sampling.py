@@ -150,7 +150,7 @@ def block_map(block: Block, size: MapSize, image_size: tuple[int, int], out: Ten
 
 
 def map_coordinate(
-    coordinate: Tensor, cells: int, stride: float | None, pixels: int, out: Tensor | None = None
+    coordinate: Tensor, cells: int, stride: float | None, pixels: int, out: Tensor | None
 ) -> Tensor:
     """Transform a normalised coordinate of the image to that of a map, clamped to its outermost centres.
 
@@ -159,7 +159,7 @@ def map_coordinate(
         cells: cells of the map along it.
         stride: px, or None, see :class:`MapSize`.
         pixels: pixels of the image along it.
-        out: (B, R, V) to write to.
+        out: (B, R, V) to write to, or None.
     """
     if stride is not None:  # x of the image to x / stride of the map
         scale = pixels / (stride * cells)

@@ -28,18 +28,10 @@ from lanebev.io.lanes.parsing import FORMATS, FrameLines, json_values, lane_text
 from lanebev.io.lanes.tusimple import read_tusimple
 from lanebev.numbers import shown
 
-
-def _of_one(read: Callable[[Path], FrameLines], path: Path) -> list[FrameLines]:
-    return [read(path)]
-
-
-_OF_ONE: dict[str, Callable[[Path], FrameLines]] = {  # what reads files of one image
-    "Lines": read_curvelanes,
-    "image_name": read_llamas,
-}
 _READERS: dict[str, Callable[[Path], list[FrameLines]]] = {  # by a key that no other kind before it has
     **{key: partial(read_annotations, pictures=pictures) for key, pictures in ANNOTATORS.items()},
-    **{key: partial(_of_one, read) for key, read in _OF_ONE.items()},
+    "Lines": lambda path: [read_curvelanes(path)],
+    "image_name": lambda path: [read_llamas(path)],
     "labels": read_bdd100k,
     "frames": read_bdd100k,
 }

@@ -33,7 +33,7 @@ Array = NDArray[np.float64]
 _FARTHEST = 1e6  # px of the image
 
 
-def read_once(path: Path, intrinsics: Array | None = None) -> FrameLines:
+def read_once(path: Path, intrinsics: Array | None) -> FrameLines:
     """Read a label or a prediction of ONCE-3DLanes, of the image that is named as the file is.
 
     Args:
@@ -53,7 +53,7 @@ def read_once(path: Path, intrinsics: Array | None = None) -> FrameLines:
         return _projected(str(path).removesuffix(".json"), lanes, intrinsics)
 
 
-def read_apollo(path: Path, intrinsics: Array | None = None) -> list[FrameLines]:
+def read_apollo(path: Path, intrinsics: Array | None) -> list[FrameLines]:
     """Read the ``laneLines`` of Apollo's synthetic images, one image a line.
 
     Args:

@@ -139,7 +139,7 @@ def sample_ego_lane(sampler: BatchSampler, layout: Layout) -> Tensor:
     return (share * lanes).long().clamp(max=7)
 
 
-def sample_world(sampler: BatchSampler, kind: str = "any") -> tuple[World, Tensor]:
+def sample_world(sampler: BatchSampler, kind: str) -> tuple[World, Tensor]:
     """Sample random worlds and an ego lane in each, (B,) int64.
 
     Args:

@@ -119,7 +119,7 @@ def boundary_polylines(
     boundaries: Boundaries,
     intrinsics: Tensor,
     extrinsics: Extrinsics,
-    num_points: int = 64,
+    num_points: int,
     vertical_curvature: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Return the seen part of each boundary as a polyline in the undistorted image, near to far.

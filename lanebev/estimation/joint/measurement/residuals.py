@@ -179,7 +179,7 @@ def boundary_distances(
     places: Tensor,
     seen: Observations,
     feet: Tensor,
-    phase: Tensor | None = None,
+    phase: Tensor | None,
 ) -> tuple[Tensor, Tensor]:
     """Compute the distances of :func:`boundary_residuals` alone, (B, 2, N) px, and their validity (B, N)."""
     rotation, _ = road_from_cam_and_roll(params[:, :HEIGHT])
