@@ -154,79 +154,84 @@ def _sample_vehicles(sampler: BatchSampler, layout: Layout, ego_lane: Tensor, op
     )
 
 
+class _Props(NamedTuple):
+    """Shapes (B, M, 2, 8) of what stands along the road, and their places across and along it, (B, M) m."""
+
+    shape: Tensor
+    across: Tensor
+    along: Tensor
+
+
 def _sample_props(
     sampler: BatchSampler, left: Tensor, right: Tensor, bridge_at: Tensor, bridge_long: Tensor
 ) -> Traffic:
     """Sample a bridge with its piers, a gantry with its legs, three signs and four lamp posts."""
-    one = torch.ones_like(left)[:, None]
-    width, middle = (right - left)[:, None], 0.5 * (left + right)[:, None]
-    bridge, reach = bridge_at.isfinite()[:, None], 0.5 * bridge_long[:, None]
-    bridge_z = torch.where(bridge, bridge_at[:, None], 0.0) + reach
-    low = sampler.uniform(4.9, 6.5, 1)
-    deck = _box(0.5 * width + 25, -reach, reach, low, low + sampler.uniform(1.0, 2.4, 1))
-    pier = _box(sampler.uniform(0.4, 0.9, 1), -0.7 * reach, 0.7 * reach, 0 * one, low).expand(-1, 2, -1)
-    pier_across = torch.cat([left[:, None] - 1.5, right[:, None] + sampler.uniform(1.5, 6, 1)], dim=1)
-
+    edges = (left[:, None], right[:, None])
+    bridge = bridge_at.isfinite()[:, None]
+    over = _sample_bridge(sampler, *edges, torch.where(bridge, bridge_at[:, None], 0.0), bridge_long[:, None])
     gantry = sampler.chance(0.25, 1)
-    gantry_z, clearance = sampler.uniform(25, 180, 1), sampler.uniform(5.6, 6.5, 1)
-    beam = _box(0.5 * width + 1.5, -0.15 * one, 0.15 * one, clearance + 0.8, clearance + 1.1)
-    board = _box(
-        sampler.uniform(1.5, 4.0, 1),
-        -0.3 * one,
-        -0.16 * one,
-        clearance,
-        clearance + sampler.uniform(1.5, 3.2, 1),
-    )
-    leg = _box(0.18 * one, -0.18 * one, 0.18 * one, 0 * one, clearance + 1.1)
-    legs_across = torch.cat([left[:, None] - 1.5, right[:, None] + 1.5], dim=1)
-
-    post = _box(0.05 * one, -0.05 * one, 0.05 * one, 0 * one, 3 * one)
-    bottom, half = sampler.uniform(1.2, 2.2, 3), sampler.uniform(0.3, 1.3, 3)
-    panel = _box(half, -0.09 + 0 * half, -0.05 + 0 * half, bottom, bottom + 2 * half.clamp(max=0.8))
-    lamp_high = sampler.uniform(8.0, 12.0, 1)
-    pole = _box(0.09 * one, -0.09 * one, 0.09 * one, 0 * one, lamp_high)
-    arm = _box(1.7 * one, -0.1 * one, 0.1 * one, lamp_high, lamp_high + 0.14)
-    lamp_side = torch.where(sampler.chance(0.5, 1), left[:, None] - 0.8, right[:, None] + 1.5)
-    lamp_gap = sampler.uniform(28, 55, 1)
-    lamp_z = sampler.uniform(5, 30, 1) + lamp_gap * torch.arange(4)
-
-    flat = torch.zeros_like(deck)
-    shape = torch.cat(
-        [
-            torch.stack([deck, flat], 2),
-            torch.stack([pier, torch.zeros_like(pier)], 2),
-            torch.stack([beam, board], 2),
-            torch.stack([leg, flat], 2).expand(-1, 2, -1, -1),
-            torch.stack([post.expand(-1, 3, -1), panel], 2),
-            torch.stack([pole, arm], 2).expand(-1, 4, -1, -1),
-        ],
-        dim=1,
-    )
+    above = _sample_gantry(sampler, *edges)
+    panels = _sample_signs(sampler)
+    lamps = _sample_lamps(sampler, *edges)
     sign_across = torch.where(sampler.chance(0.75, 3), right[:, None] + 1.8, left[:, None] - 1.2)
-    across = torch.cat(
-        [middle, pier_across, middle, legs_across, sign_across, lamp_side.expand(-1, 4)], dim=1
-    )
-    along = torch.cat(
-        [bridge_z.expand(-1, 3), gantry_z.expand(-1, 3), sampler.uniform(12, 160, 3), lamp_z], dim=1
-    )
+    signs = _Props(panels, sign_across, sampler.uniform(12, 160, 3))
+    shape, across, along = (torch.cat(part, 1) for part in zip(over, above, signs, lamps, strict=True))
+
     kind = torch.tensor([BRIDGE, POLE, POLE, SIGN, POLE, POLE, SIGN, SIGN, SIGN, POLE, POLE, POLE, POLE])
     concrete = sampler.uniform(0.15, 0.4, 1, 1) * torch.tensor([1.0, 0.97, 0.93])
     steel = sampler.uniform(0.1, 0.4, 1, 1) * torch.ones(3)
-    signs = sampler.pick_from(SIGN_COLOURS, 4)
+    board, *boards = sampler.pick_from(SIGN_COLOURS, 4).split(1, dim=1)
     colour = torch.cat(
-        [
-            concrete.expand(-1, 3, -1),
-            signs[:, :1],
-            steel.expand(-1, 2, -1),
-            signs[:, 1:],
-            steel.expand(-1, 4, -1),
-        ],
-        1,
+        [concrete.expand(-1, 3, -1), board, steel.expand(-1, 2, -1), *boards, steel.expand(-1, 4, -1)], 1
     )
-    lamps = sampler.chance(0.3, 1).expand(-1, 4)
-    valid = torch.cat([bridge.expand(-1, 3), gantry.expand(-1, 3), sampler.chance(0.35, 3), lamps], dim=1)
+    lit = sampler.chance(0.3, 1).expand(-1, 4)
+    valid = torch.cat([bridge.expand(-1, 3), gantry.expand(-1, 3), sampler.chance(0.35, 3), lit], dim=1)
     off = torch.zeros_like(valid)
     return Traffic(along, across, 0.0 * along, shape, kind.expand_as(along), colour, off, valid)
+
+
+def _sample_bridge(sampler: BatchSampler, left: Tensor, right: Tensor, at: Tensor, long: Tensor) -> _Props:
+    """Sample a deck and two piers; (B, 1) each: the pavement's edges, where it begins and its length."""
+    reach = 0.5 * long
+    low = sampler.uniform(4.9, 6.5, 1)
+    deck = _box(0.5 * (right - left) + 25, -reach, reach, low, low + sampler.uniform(1.0, 2.4, 1))
+    pier = _box(sampler.uniform(0.4, 0.9, 1), -0.7 * reach, 0.7 * reach, 0 * low, low).expand(-1, 2, -1)
+    across = torch.cat([0.5 * (left + right), left - 1.5, right + sampler.uniform(1.5, 6, 1)], dim=1)
+    boxes = torch.cat([deck, pier], 1)
+    return _Props(torch.stack([boxes, torch.zeros_like(boxes)], 2), across, (at + reach).expand(-1, 3))
+
+
+def _sample_gantry(sampler: BatchSampler, left: Tensor, right: Tensor) -> _Props:
+    """Sample a beam with its board, and two legs; (B, 1) each: the pavement's edges."""
+    one = torch.ones_like(left)
+    along, clearance = sampler.uniform(25, 180, 1), sampler.uniform(5.6, 6.5, 1)
+    beam = _box(0.5 * (right - left) + 1.5, -0.15 * one, 0.15 * one, clearance + 0.8, clearance + 1.1)
+    half, tall = sampler.uniform(1.5, 4.0, 1), sampler.uniform(1.5, 3.2, 1)
+    board = _box(half, -0.3 * one, -0.16 * one, clearance, clearance + tall)
+    leg = _box(0.18 * one, -0.18 * one, 0.18 * one, 0 * one, clearance + 1.1)
+    legs = torch.stack([leg, torch.zeros_like(leg)], 2).expand(-1, 2, -1, -1)
+    across = torch.cat([0.5 * (left + right), left - 1.5, right + 1.5], dim=1)
+    return _Props(torch.cat([torch.stack([beam, board], 2), legs], 1), across, along.expand(-1, 3))
+
+
+def _sample_signs(sampler: BatchSampler) -> Tensor:
+    """Sample the shapes of three signs on their posts."""
+    bottom, half = sampler.uniform(1.2, 2.2, 3), sampler.uniform(0.3, 1.3, 3)
+    zero = torch.zeros_like(half)
+    post = _box(zero + 0.05, zero - 0.05, zero + 0.05, zero, zero + 3)
+    panel = _box(half, zero - 0.09, zero - 0.05, bottom, bottom + 2 * half.clamp(max=0.8))
+    return torch.stack([post, panel], 2)
+
+
+def _sample_lamps(sampler: BatchSampler, left: Tensor, right: Tensor) -> _Props:
+    """Sample four equal lamp posts in a row; (B, 1) each: the pavement's edges."""
+    one, high = torch.ones_like(left), sampler.uniform(8.0, 12.0, 1)
+    pole = _box(0.09 * one, -0.09 * one, 0.09 * one, 0 * one, high)
+    arm = _box(1.7 * one, -0.1 * one, 0.1 * one, high, high + 0.14)
+    across = torch.where(sampler.chance(0.5, 1), left - 0.8, right + 1.5)
+    gap = sampler.uniform(28, 55, 1)
+    along = sampler.uniform(5, 30, 1) + gap * torch.arange(4)
+    return _Props(torch.stack([pole, arm], 2).expand(-1, 4, -1, -1), across.expand(-1, 4), along)
 
 
 def place_objects(traffic: Traffic, alignment: Alignment, start: Tensor, side: Tensor) -> SceneObjects:
