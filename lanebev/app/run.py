@@ -16,6 +16,7 @@ from lanebev.app.continued.resume import (
     CALIBRATION_FILE,
     STATE_FILE,
     backup_state,
+    last_frame,
     load_states,
     resume_remark,
 )
@@ -111,7 +112,7 @@ def run(
             tracker, _ = resumed_tracker(config, camera)
             last_observer = observer_of_second_pass(out, observer, reusing, source)
         recorder = _recorder(config, source, camera, out)
-        of_state = problem or resume_remark(config)
+        of_state = problem or resume_remark(config, source)
         said = (source.problem, of_state, observer.remark, *remarks(config, source, camera))
         recorder.problems += filter(None, said)
         frames = observed_frames(source, last_observer)
@@ -127,7 +128,9 @@ def run(
         upside_down = upside_down_remark(observer, tracker, source, tracked, len(recorder.rows))
         of_run = (unfit_mount_remark(config.mount, recorder.rows), upside_down)
         recorder.problems += filter(None, of_run)
-        facts = run_facts(config, source, camera) | facts_of(reusing) | _save_tracker(tracker, camera, out)
+        last = last_frame(source, len(recorder.rows))
+        saved = _save_tracker(tracker, camera, last, out)
+        facts = run_facts(config, source, camera) | facts_of(reusing) | saved
         logger.info("writing the report")
         report = recorder.finish(facts, Path(source.source).name, truth, tracker.mount)
         if config.formats:
@@ -153,11 +156,13 @@ def estimates(
         yield Recorded(frame=frame, name=name, seen=seen, estimate=estimate, filtered=filtered)
 
 
-def _save_tracker(tracker: RunTracker, camera: Camera, out: OutputFolder) -> dict[str, str]:
+def _save_tracker(
+    tracker: RunTracker, camera: Camera, last: list[str | int] | None, out: OutputFolder
+) -> dict[str, str]:
     """Write the state and the mount after a drive, and return the mount's facts; nothing after stills."""
     if tracker.mount is None:
         return {}
-    plain = {"camera": camera.fingerprint(), "lane_width": tracker.lane_width}
+    plain = {"camera": camera.fingerprint(), "lane_width": tracker.lane_width, "last_frame": last}
     save_state(out / STATE_FILE, {**tracker.states(), **plain})
     write_calibration(out / CALIBRATION_FILE, camera, tracker.mount)
     return mount_facts(tracker.mount)

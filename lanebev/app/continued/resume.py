@@ -4,9 +4,11 @@ from dataclasses import replace
 from pathlib import Path
 
 from lanebev.app.config import CALIBRATORS, RunConfig
+from lanebev.app.continued.recovery import size_and_time
 from lanebev.app.drive.build import make_tracker
 from lanebev.app.drive.observers import RunTracker
 from lanebev.camera.model import Camera
+from lanebev.io.frame_source import FrameSource
 from lanebev.io.output.folder import OutputFolder
 from lanebev.io.state import lane_width_remark, load_state
 
@@ -45,12 +47,48 @@ def load_states(config: RunConfig, tracker: RunTracker, camera: Camera) -> str |
     return None
 
 
-def resume_remark(config: RunConfig) -> str:
-    """Return a remark on a state to resume that was saved with lanes of another width; else nothing."""
+def resume_remark(config: RunConfig, source: FrameSource) -> str:
+    """Return a remark on a state of lanes of another width or of frames that come again; else nothing."""
     if config.resume is None:
         return ""
-    remark = lane_width_remark(load_state(Path(config.resume) / STATE_FILE), config.taken_lane_width[0])
+    loaded = load_state(Path(config.resume) / STATE_FILE)
+    of_width = lane_width_remark(loaded, config.taken_lane_width[0])
+    remark = of_width or _again_remark(source, loaded.metadata.get("last_frame"))
     return f"resume: {remark}" if remark else ""
+
+
+def last_frame(source: FrameSource, count: int) -> list[str | int] | None:
+    """Return the last one of so many frames of a source, as :func:`_again_remark` recognises it again.
+
+    Returns:
+        name, size and time of change of its file, and its number in the source; None of a stream.
+    """
+    numbers = [] if source.is_live else source.taken_numbers[:count]
+    return [*_file_of(source, numbers[-1]), numbers[-1]] if numbers else None
+
+
+def _again_remark(source: FrameSource, last: list[str | int] | None) -> str:
+    """Return a remark on a source of which the last frame of a state, or one after it, is taken again."""
+    numbers = [] if source.is_live or not last else source.taken_numbers
+    if not (last and numbers):
+        return ""
+    *file, number = last
+    if source.is_video:
+        is_again = numbers[0] <= int(number) and _file_of(source, numbers[0]) == file
+    else:
+        is_again = any(_file_of(source, each) == file for each in numbers)
+    if not is_again:
+        return ""
+    return (
+        f"the state contains frames of this source already, up to number {number}, which now count twice; "
+        "begin after it by --start, or without --resume"
+    )
+
+
+def _file_of(source: FrameSource, number: int) -> list[str | int]:
+    """Return name, size and time of change of the file of a frame."""
+    path = Path(source.source if source.is_video else source.paths[number])
+    return [path.name, *size_and_time(path)]
 
 
 def backup_state(resume: str, out: OutputFolder) -> str:

@@ -42,6 +42,24 @@ def test_resuming_gives_what_an_uninterrupted_run_gives(data, tmp_path, calibrat
         assert all(torch.equal(one[name][field], other[name][field]) for field in one[name])
 
 
+@pytest.mark.parametrize(
+    "given",
+    [{"source": "drive.mp4", "lanes": "video_lanes.json"}, {"source": "images", "lanes": "lanes.json"}],
+    ids=["video", "images"],
+)
+def test_frames_that_a_state_contains_already_are_noticed(data, tmp_path, capsys, given):
+    out = tmp_path / "out"
+    again = "problem: resume: the state contains frames of this source already, up to number 2, which now"
+    for options, is_again in (
+        (["--end", "0.09"], False),
+        (["--resume", str(out), "--start", "0.09"], False),
+        (["--end", "0.09"], False),
+        (["--resume", str(out)], True),
+    ):
+        assert run(data, "--no-video", *options, out=out, **given) == 0
+        assert (again in capsys.readouterr().out) == is_again
+
+
 @pytest.mark.slow
 def test_a_damaged_state_is_reported_and_a_missing_one_refused(data, tmp_path, capsys):
     assert run(data, source="images/[3].png", out=tmp_path / "out") == 0
