@@ -4,7 +4,7 @@ from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import lightning as L
 import numpy as np
@@ -225,11 +225,7 @@ class LaneFiles(L.LightningDataModule):
         entries = read_entries(self.layout, self.root, self.val)
         check_labels(entries)
         data = ScoredBatches(entries, self.layout, self.batch_size, self.val_size, self.view)
-        return DataLoader(data, batch_size=None, collate_fn=_as_it_is)
+        return DataLoader(data, batch_size=None, collate_fn=lambda batch: batch)
 
     test_dataloader = val_dataloader
     predict_dataloader = val_dataloader
-
-
-def _as_it_is(batch: Any) -> Any:
-    return batch

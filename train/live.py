@@ -44,6 +44,7 @@ class Block(NamedTuple):
         return Views(*(field[batch * self.fresh : (batch + 1) * self.fresh] for field in self.views))
 
 
+@dataclass(eq=False)
 class LiveBatches(IterableDataset[Batch]):
     """Endless batches of new views; with ``repeats`` each view is in that many consecutive batches.
 
@@ -64,26 +65,21 @@ class LiveBatches(IterableDataset[Batch]):
         far_share: probability that a block's views are far views, see :func:`far_stage`.
     """
 
-    def __init__(
-        self,
-        share: Callable[[int], float],
-        stages: list[Stage],
-        repeats: int,
-        together: int,
-        view: ViewConfig,
-        window: WindowConfig | None,
-        seed: Seed,
-        first: int,
-        device: torch.device,
-        rows: int,
-        far_share: float = 0.0,
-    ) -> None:
-        super().__init__()
-        self.far_share = far_share
-        self.share, self.stages, self.repeats, self.together = share, stages, repeats, together
-        self.view, self.window, self.seed, self.first = view, window, seed, first
-        self.device, self.rows = device, rows
-        self.watch = Stopwatch(device)
+    share: Callable[[int], float]
+    stages: list[Stage]
+    repeats: int
+    together: int
+    view: ViewConfig
+    window: WindowConfig | None
+    seed: Seed
+    first: int
+    device: torch.device
+    rows: int
+    far_share: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Make the watch of rendering and labelling."""
+        self.watch = Stopwatch(self.device)
 
     def __iter__(self) -> Iterator[Batch]:
         """Render, mirror, label."""

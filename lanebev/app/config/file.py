@@ -45,11 +45,7 @@ def load_plain_yaml(text: str) -> object:
         yaml.YAMLError: the text is none.
         ValueError: a key is given twice.
     """
-    loader = _PlainLoader(text)
-    try:
-        loaded: object = loader.get_single_data()
-    finally:
-        loader.dispose()
+    loaded: object = yaml.load(text, Loader=_PlainLoader)
     return loaded
 
 
