@@ -172,13 +172,13 @@ class Session:
             if not math.isfinite(speed):
                 raise ValueError(f"speed: expected finite m/s, or None if it is not known, got {speed}")
         pixels = None if frame is None else self._rgb(frame)
-        dt, remarks = self._clock.step(stamp)
         fast = fast_remark(speed or 0.0, "divide it by 3.6")
         lost = "no frame was given" if frame is None and polylines is None else ""
-        self._images.add(None if pixels is None else image_bytes(pixels[:, ::STRIDE, ::STRIDE]))
         with torch.inference_mode():
             vertices, scale = self._vertices(pixels, polylines)
+            dt, remarks = self._clock.step(stamp)  # not of a frame that is refused
             _, calibration, reasons, vertical_curvature = self.tracker.drive_frame(vertices, dt, scale, speed)
+        self._images.add(None if pixels is None else image_bytes(pixels[:, ::STRIDE, ::STRIDE]))
         mounted = self.tracker.mount
         assert mounted is not None  # after a frame
         bev, valid = None, None

@@ -65,6 +65,14 @@ def test_a_stamp_that_does_not_advance_changes_nothing_and_says_so():
     assert numbers(after) == pytest.approx(numbers(before), abs=1e-3)
 
 
+def test_the_time_of_a_frame_that_is_refused_is_not_lost():
+    session = Session(CAMERA)
+    session(polylines=lines(), stamp=0.0)
+    with pytest.raises(ValueError, match=r"expected \(P, 2\) px"):
+        session(polylines=[np.zeros((5, 3))], stamp=0.1)
+    assert session(polylines=lines(), stamp=0.2).dt == pytest.approx(0.2)
+
+
 def test_a_clock_that_was_set_back_does_not_end_a_session():
     session = Session(CAMERA)
     for k in range(5):
