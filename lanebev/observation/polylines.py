@@ -14,7 +14,7 @@ from lanebev.geometry.lens import normalise_points
 from lanebev.numbers import shown
 from lanebev.observation.boundary_order import boundary_indices, width_ratios
 from lanebev.observation.boundary_vertices import BoundaryVertices
-from lanebev.types import NUM_BOUNDARIES
+from lanebev.types import NUM_BOUNDARIES, check_pixels
 
 ROW_STEP = 10
 """px between the rows on which a polyline is sampled: neighbours on one row err alike, and say so once."""
@@ -126,8 +126,11 @@ def lines_from_polylines(
     named = isinstance(polylines, Mapping)
     lines = []
     for key, given in polylines.items() if isinstance(polylines, Mapping) else enumerate(polylines):
+        if isinstance(given, Tensor) and given.is_floating_point():
+            check_pixels(f"polylines[{key}]", given)
         try:
-            points = np.array(given.tolist() if isinstance(given, Tensor) else given, dtype=np.float64)
+            listed = given.tolist() if isinstance(given, Tensor) else given
+            points = np.ma.array(listed, dtype=np.float64, copy=True).filled(np.nan)  # of masked ones too
         except (TypeError, ValueError) as error:
             raise ValueError(f"polylines[{key}]: expected (P, 2) px, got {shown(given)}") from error
         if points.shape == (0,):  # an empty list, of a line that is not seen

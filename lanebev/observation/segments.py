@@ -90,8 +90,8 @@ class LaneSegments(NamedTuple):
 
         Args:
             polylines: one for each boundary, (P, 2) px (x, y) of the image as taken, along the boundary in
-                either direction; x, or x and y, are NaN in a gap. A mapping from number to polyline if the
-                detector knows the numbers (0..L-1, left to right).
+                either direction; x, or x and y, are NaN or masked in a gap. A mapping from number to
+                polyline if the detector knows the numbers (0..L-1, left to right).
             camera: the lens.
             sigma: px, standard deviation of a polyline across its line.
             num_boundaries: L.
@@ -100,7 +100,7 @@ class LaneSegments(NamedTuple):
             segments of batch size 1, in double precision.
 
         Raises:
-            ValueError: a polyline of another shape, or a number outside 0..L-1.
+            ValueError: a polyline of another shape or in half precision, or a number outside 0..L-1.
         """
         return segments_from_lines(
             [lines_from_polylines(polylines, sigma, num_boundaries)], camera, num_boundaries

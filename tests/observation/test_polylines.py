@@ -149,15 +149,21 @@ def test_a_line_is_not_joined_across_points_without_coordinates():
     line = np.stack([np.linspace(640, 300, 39), np.arange(330, 711, 10)], axis=-1)
     gap, nowhere = line.copy(), line.copy()
     gap[10:20, 0], nowhere[10:20] = np.nan, np.nan
-    one, other = (LaneSegments.from_polylines({2: each}, CAMERA) for each in (gap, nowhere))
-    torch.testing.assert_close(one.endpoints, other.endpoints)
-    assert (one.weight > 0).sum() == 14  # of 29 rows
+    masked = np.ma.masked_array(line, np.isnan(nowhere))
+    for each in (gap, nowhere, masked):
+        found = LaneSegments.from_polylines({2: each}, CAMERA)
+        assert (found.weight > 0).sum() == 14  # of 29 rows
+        torch.testing.assert_close(found.endpoints, LaneSegments.from_polylines({2: gap}, CAMERA).endpoints)
 
 
 @pytest.mark.parametrize(
     ("polylines", "message"),
     [
         ([np.zeros((4, 3))], r"polylines\[0\]: expected \(P, 2\) px, got shape \(4, 3\)"),
+        (
+            [torch.zeros(4, 2).bfloat16()],
+            r"polylines\[0\]: expected float32 or float64, .* which rounds them",
+        ),
         ([np.zeros((4, 2)), [["a", 3]]], r"polylines\[1\]: expected"),
         ({6: np.zeros((4, 2))}, "polylines: expected boundaries 0 to 5, got 6"),
         ({"2": np.zeros((4, 2))}, "polylines: expected boundaries 0 to 5, got '2'"),
