@@ -499,18 +499,23 @@ def test_an_encoding_that_is_not_known_is_no_damage(tmp_path):
         open_bag_source(path)
 
 
-def test_foxgloves_messages_in_ros_2(tmp_path):
-    name = "foxglove_msgs/msg/CompressedImage"
+def _foxglove_bag(path, name, form, contents):
+    """A ROS 2 bag of Foxglove's messages of numbers and bytes."""
     fields = "builtin_interfaces/Time timestamp\nstring frame_id\nuint8[] data\nstring format\n"
     store = get_typestore(Stores.ROS2_HUMBLE)
     store.register(get_types_from_msg(fields, name))
-    with Writer(tmp_path / "bag", version=9) as writer:
+    with Writer(path, version=9) as writer:
         connection = writer.add_connection("/cam", name, typestore=store)
-        for number in range(COUNT):
-            made = _compressed(number)
-            message = store.types[name](made.header.stamp, "camera", made.data, "png")
+        for number, data in contents:
+            message = store.types[name](_header(number).stamp, "camera", data, form)
             writer.write(connection, round(1e9 * START) + number, store.serialize_cdr(message, name))
-    frames = list(open_bag_source(str(tmp_path / "bag")))
+    return str(path)
+
+
+def test_foxgloves_messages_in_ros_2(tmp_path):
+    contents = [(number, _compressed(number).data) for number in range(COUNT)]
+    path = _foxglove_bag(tmp_path / "bag", "foxglove_msgs/msg/CompressedImage", "png", contents)
+    frames = list(open_bag_source(path))
     assert [frame.image[0, 0, 0] for frame in frames] == [20 * number for number in range(COUNT)]
     assert [frame.time for frame in frames] == pytest.approx(np.arange(COUNT) / 10, abs=1e-6)
 
@@ -526,22 +531,14 @@ def _packets(count):
 
 @pytest.mark.parametrize("lost", [0, 2])
 def test_a_video_of_foxglove(tmp_path, lost):
-    name, packets = "foxglove_msgs/msg/CompressedVideo", _packets(10)
-    fields = "builtin_interfaces/Time timestamp\nstring frame_id\nuint8[] data\nstring format\n"
-    store = get_typestore(Stores.ROS2_HUMBLE)
-    store.register(get_types_from_msg(fields, name))
-    with Writer(tmp_path / "bag", version=9) as writer:
-        connection = writer.add_connection("/cam", name, typestore=store)
-        for number in range(lost, 10):
-            data = np.frombuffer(packets[number], np.uint8)
-            message = store.types[name](_header(number).stamp, "camera", data, "h264")
-            writer.write(connection, round(1e9 * START) + number, store.serialize_cdr(message, name))
-    frames = list(make_source(RunConfig(str(tmp_path / "bag"), "c")))
+    contents = [(number, np.frombuffer(data, np.uint8)) for number, data in enumerate(_packets(10))]
+    path = _foxglove_bag(tmp_path / "bag", "foxglove_msgs/msg/CompressedVideo", "h264", contents[lost:])
+    frames = list(make_source(RunConfig(path, "c")))
     early = 4 - lost if lost else 0  # before the first key frame
     assert [frame.image is None for frame in frames] == [True] * early + [False] * (10 - lost - early)
     for number, frame in enumerate(frames[early:], start=lost + early):
         assert np.abs(frame.image.astype(int) - _picture(number)).mean() < 4
-    some = list(make_source(RunConfig(str(tmp_path / "bag"), "c", every=3)))
+    some = list(make_source(RunConfig(path, "c", every=3)))
     assert [frame.source_number for frame in some] == list(range(0, 10 - lost, 3))
     assert np.abs(some[-1].image.astype(int) - _picture(lost + some[-1].source_number)).mean() < 4
 
