@@ -97,24 +97,51 @@ def sample_surroundings(
         opposite: (B,) m, the opposite carriageway's right edge; -infinite: none.
         median: (B,) bool, a concrete barrier stands along the left edge, darker than others.
     """
-    far = [
-        torch.where(sampler.chance(0.75), sampler.pick([0, 0, 0, 5, 0, 2.5, 0.5]), 0) for _ in range(2)
-    ]  # trees, slopes, hedges
+    kind, across = _places_of_walls(sampler, left, right, opposite, median)
+    height, colour = _sizes_and_colours(sampler, kind, median)
+    zenith, skyline = _sky(sampler, grey[:, None])
+    verge = torch.where(sampler.chance(0.5, 1, 1), sampler.pick_from(GREENS, 2), sampler.pick_from(EARTHS, 2))
+    return Surroundings(
+        wall_across=across,
+        wall_kind=kind,
+        wall_height=height,
+        wall_colour=colour,
+        wall_seed=sampler.uniform(0, 1, NUM_WALLS),
+        wall_toe=sampler.sometimes(0.6, 1.1, 3.0, NUM_WALLS, otherwise=1.0),
+        verge=verge * sampler.uniform(0.7, 1.3, 1, 1),
+        zenith=zenith,
+        skyline=skyline,
+        cloud=sampler.sometimes(0.35, 0.0, 0.8),
+        opposite=opposite,
+        opposite_colour=sampler.uniform(0.06, 0.3, 1) * torch.tensor([1.0, 0.99, 0.96]),
+        hill_height=sampler.sometimes(0.6, 0.0, 0.09, 2, otherwise=-0.05),
+        hill_colour=(0.5 * sampler.pick_from(GREENS) + 0.5 * sampler.pick_from(EARTHS)),
+    )
+
+
+def _places_of_walls(
+    sampler: BatchSampler, left: Tensor, right: Tensor, opposite: Tensor, median: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Sample the kind of the six walls, int64, and their place across, m: far, middle and near, (B, 6)."""
+    trees = [0, 0, 0, 5, 0, 2.5, 0.5]  # with slopes and hedges
+    far = [torch.where(sampler.chance(0.75), sampler.pick(trees), 0) for _ in range(2)]
     middle = [torch.where(sampler.chance(0.45), sampler.pick([0, 0, 0, 3, 3, 2, 2]), 0) for _ in range(2)]
     near = [sampler.pick([2, 6, 1.5]), sampler.pick([4, 3, 2.5])]  # the median has a barrier more often
-    kind = torch.stack([far[0], far[1], middle[0], middle[1], near[0], near[1]], dim=1)
+    kind = torch.stack([*far, *middle, *near], dim=1)
     divided = opposite.isfinite()
     kind[:, 2] = torch.where(divided, NOTHING, kind[:, 2])
     kind[:, 4] = torch.where(median, CONCRETE, kind[:, 4])
-    close = sampler.uniform(0.05, 1.2, 2) * sampler.pick_from(
-        [0.0, 1.0], 2
-    )  # at the pavement's edge, or behind it
+    # near ones stand at the pavement's edge, or behind it
+    close = sampler.uniform(0.05, 1.2, 2) * sampler.pick_from([0.0, 1.0], 2)
     close[:, 0] = torch.where(median, 0.0, close[:, 0])
     gap = torch.cat([sampler.uniform(14, 45, 2), sampler.uniform(4, 14, 2), close], dim=1)
-    sides = torch.tensor([-1.0, 1.0] * 3)
-    across = torch.stack([left, right] * 3, dim=1) + sides * gap
-
+    across = torch.stack([left, right] * 3, dim=1) + torch.tensor([-1.0, 1.0] * 3) * gap
     across[:, 0] = torch.where(divided, torch.minimum(across[:, 0], opposite - 16), across[:, 0])
+    return kind, across
+
+
+def _sizes_and_colours(sampler: BatchSampler, kind: Tensor, median: Tensor) -> tuple[Tensor, Tensor]:
+    """Sample heights (B, 6) m and colours (B, 6, 3) of walls by their kind."""
     low = sampler.pick_from([0.55, 0.81, 0.9, 1.07, 1.4], NUM_WALLS)
     tall = sampler.uniform(4.0, 14.0, NUM_WALLS)
     height = torch.where(kind == CONCRETE, low, tall)
@@ -127,27 +154,15 @@ def sample_surroundings(
     colour = torch.where(((kind == TREES) | (kind == HEDGE))[..., None], green, grey_wall)
     colour = torch.where((kind == SLOPE)[..., None], earth, colour)
     colour = colour * sampler.uniform(0.7, 1.3, NUM_WALLS, 1)
+    return height, colour
 
+
+def _sky(sampler: BatchSampler, grey: Tensor) -> tuple[Tensor, Tensor]:
+    """Sample the sky's radiance (B, 3) above and at the horizon; grey is (B, 1) in [0, 1]."""
     blue = sampler.uniform(0.18, 0.45, 1) * torch.tensor([0.30, 0.60, 1.0]) * (1 + sampler.normal(0.06, 3))
     pale = torch.stack(
         [sampler.uniform(0.28, 0.52), sampler.uniform(0.36, 0.54), sampler.uniform(0.44, 0.6)], dim=1
     )
     overcast = sampler.uniform(0.35, 0.7, 1) * torch.tensor([0.97, 1.0, 1.03])
-    mix = grey[:, None]
-    verge = torch.where(sampler.chance(0.5, 1, 1), sampler.pick_from(GREENS, 2), sampler.pick_from(EARTHS, 2))
-    return Surroundings(
-        wall_across=across,
-        wall_kind=kind,
-        wall_height=height,
-        wall_colour=colour,
-        wall_seed=sampler.uniform(0, 1, NUM_WALLS),
-        wall_toe=sampler.sometimes(0.6, 1.1, 3.0, NUM_WALLS, otherwise=1.0),
-        verge=verge * sampler.uniform(0.7, 1.3, 1, 1),
-        zenith=blue * (1 - mix) + 0.9 * overcast * mix,
-        skyline=pale * (1 - mix) + overcast * mix,
-        cloud=sampler.sometimes(0.35, 0.0, 0.8),
-        opposite=opposite,
-        opposite_colour=sampler.uniform(0.06, 0.3, 1) * torch.tensor([1.0, 0.99, 0.96]),
-        hill_height=sampler.sometimes(0.6, 0.0, 0.09, 2, otherwise=-0.05),
-        hill_colour=(0.5 * sampler.pick_from(GREENS) + 0.5 * sampler.pick_from(EARTHS)),
-    )
+    zenith = blue * (1 - grey) + 0.9 * overcast * grey
+    return zenith, pale * (1 - grey) + overcast * grey
