@@ -199,7 +199,7 @@ def test_worlds_without_a_street_have_no_kerbs_or_paint() -> None:
     world: World = sample_world(sampler_of(4, 1), "highway")[0]
     assert not world.street.kerbed.any()
     assert (world.street.glyph < 0).all()
-    assert not world.street.hatch.any()
+    assert not world.street.hatching.strength.any()
 
 
 def test_a_kerb_is_the_boundary_where_nothing_is_painted_and_no_strip_lies_between() -> None:

@@ -67,7 +67,7 @@ def bare_world(sampler: BatchSampler, kind: str = "highway") -> tuple[World, tor
         weather=weather,
         bridge=bridge,
     )
-    return world._replace(shade=none, street=no_street(sampler)), ego_lane
+    return world._replace(shade=none, street=no_street(world.street)), ego_lane
 
 
 @pytest.mark.slow

@@ -214,6 +214,7 @@ def _with_street(
     """Replace highways by streets where a world is in a city."""
     city, lane, first, own = sample_city_layout(sampler, layout)
     street = sample_street(sampler, city, lane, first, own)
+    sampler.uniform(0, 1)  # for nothing: what is drawn after it stays as it was
     city = city._replace(
         missing_period=street.junction_period[:, None].expand_as(city.across),
         missing_length=street.junction_length[:, None].expand_as(city.across),
@@ -222,7 +223,7 @@ def _with_street(
     return (
         select_rows(kinds.city, city, layout),
         torch.where(kinds.city, lane, ego_lane),
-        select_rows(kinds.city, street, no_street(sampler)),
+        select_rows(kinds.city, street, no_street(street)),
     )
 
 

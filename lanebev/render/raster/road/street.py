@@ -111,24 +111,25 @@ def _glyphs(street: Street, ground: Ground, lane: Tensor, inside: Tensor, width:
 def _hatching(street: Street, ground: Ground, lane: Tensor, inside: Tensor, width: Tensor) -> Tensor:
     """Draw oblique stripes or chevrons that fill a lane, or grow into it from its left boundary."""
     _, along, _, reach_along, reach_across = ground
-    chevron = street.hatch_chevron[:, None]
-    slope = street.hatch_slope[:, None]
+    hatching = street.hatching
+    chevron = hatching.chevron[:, None]
+    slope = hatching.slope[:, None]
     oblique = along + slope * torch.where(chevron > 0, inside.abs(), inside)
     reach = reach_along + slope.abs() * reach_across
     stripe = dash_coverage(
         oblique,
-        (street.hatch_width * (1 + street.hatch_slope**2).sqrt()).minimum(0.6 * street.hatch_period)[:, None],
-        street.hatch_period[:, None],
+        (hatching.width * (1 + hatching.slope**2).sqrt()).minimum(0.6 * hatching.period)[:, None],
+        hatching.period[:, None],
         reach,
     )
-    start = (along + street.phase[:, None] + 40.0) % street.hatch_every[:, None]  # m beyond its begin
-    taper = street.hatch_taper[:, None]
+    start = (along + street.phase[:, None] + 40.0) % hatching.every[:, None]  # m beyond its begin
+    taper = hatching.taper[:, None]
     share = torch.where(taper > 0, start * taper, width).minimum(width)
     from_left = inside + 0.5 * width
     stripe = stripe * band(from_left, 0.2 + 0 * share, share - 0.1, reach_across)
     rim = stripe_coverage(from_left - share, 0.14, reach_across) * (share < width)
-    here = start < street.hatch_length[:, None]
-    return torch.maximum(stripe, rim) * here * street.hatch.gather(1, lane)
+    here = start < hatching.length[:, None]
+    return torch.maximum(stripe, rim) * here * hatching.strength.gather(1, lane)
 
 
 def _across_the_road(street: Street, layout: Layout, pavement: Pavement, ground: Ground) -> Tensor:

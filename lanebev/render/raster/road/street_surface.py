@@ -16,13 +16,13 @@ RAIL_GAUGE = 1.435  # m
 def tracks(street: Street, ground: Ground, albedo: Tensor) -> Tensor:
     """Draw tram rails in their bed over a reflectance (B, 3, N)."""
     _, along, across, reach_along, reach_across = ground
-    aside = across - street.tram_across[:, None]
-    on = street.tram[:, None]
-    bed = (1 - beyond(aside.abs(), 1.25, reach_across)) * street.tram_bed[:, None] * (on > 0)
+    aside = across - street.tram.across[:, None]
+    on = street.tram.strength[:, None]
+    bed = (1 - beyond(aside.abs(), 1.25, reach_across)) * street.tram.bed[:, None] * (on > 0)
     stones = sample_grain(along / 11.0, across / 11.0) / (1 + reach_along / 0.1)
     sleeper = dash_coverage(along, 0.26, torch.full_like(along, 0.65), reach_along)
-    ballast = street.tram_ballast[:, None] * (0.5 * stones - 0.45 * sleeper)
-    surface = street.tram_colour[..., None] * (1 + 0.1 * stones + ballast).clamp(min=0.2)[:, None]
+    ballast = street.tram.ballast[:, None] * (0.5 * stones - 0.45 * sleeper)
+    surface = street.tram.colour[..., None] * (1 + 0.1 * stones + ballast).clamp(min=0.2)[:, None]
     albedo = albedo + (surface - albedo) * bed[:, None]
     rail = stripe_coverage(aside.abs() - 0.5 * RAIL_GAUGE, 0.07, reach_across)
     groove = stripe_coverage(aside.abs() - 0.5 * RAIL_GAUGE + 0.06, 0.05, reach_across)

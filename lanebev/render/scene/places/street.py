@@ -8,6 +8,7 @@ from torch import Tensor
 from lanebev.render.scene.objects.surroundings import GREENS
 from lanebev.render.scene.road.layout import MAX_BOUNDARIES, WHITE, Layout
 from lanebev.render.scene.sampler import BatchSampler
+from lanebev.tensors import map_tensors
 
 PLAIN, PARKING, CYCLING = range(3)  # strips between the outer boundary and the kerb
 NO_CROSSING, ZEBRA, FORD = range(3)  # a ford: two dashed lines
@@ -19,6 +20,48 @@ TEETH, BICYCLE, DIAMOND, CROSS = range(9, 13)
 TEXTS = ("BUS", "30", "50", "STOP", "SLOW", "P", "TAXI", "SCHOOL")
 WORDS = tuple(range(13, 13 + len(TEXTS)))
 NUM_GLYPHS = 13 + len(TEXTS)
+
+
+class Hatching(NamedTuple):
+    """Oblique stripes that fill a lane, (B,) unless said otherwise.
+
+    Attributes:
+        strength: (B, K) in [0, 1], right of each boundary.
+        width: m, of a stripe.
+        period: m.
+        slope: m along per metre across.
+        chevron: 1: stripes meet in the middle.
+        length: m of every ``every``; beyond it the lane is plain.
+        every: m.
+        taper: m across per metre along by which the hatching grows; 0: it fills the lane at once.
+    """
+
+    strength: Tensor
+    width: Tensor
+    period: Tensor
+    slope: Tensor
+    chevron: Tensor
+    length: Tensor
+    every: Tensor
+    taper: Tensor
+
+
+class Tram(NamedTuple):
+    """A tram's track in the street, (B,) unless said otherwise; strengths are in [0, 1].
+
+    Attributes:
+        strength: of the rails.
+        across: m, middle of the track.
+        bed: strength of the track's own bed.
+        colour: (B, 3) linear reflectance of it.
+        ballast: strength of its stones and sleepers.
+    """
+
+    strength: Tensor
+    across: Tensor
+    bed: Tensor
+    colour: Tensor
+    ballast: Tensor
 
 
 class Street(NamedTuple):
@@ -48,19 +91,8 @@ class Street(NamedTuple):
         glyph: (B, K) int64, painted in the lane right of each boundary; negative: nothing.
         glyph_period: m.
         glyph_scale: factor of a glyph's size.
-        hatch: (B, K) strength of hatching right of each boundary.
-        hatch_width: m, of a stripe.
-        hatch_period: m.
-        hatch_slope: m along per metre across.
-        hatch_chevron: 1: stripes meet in the middle.
-        hatch_length: m of every ``hatch_every``; beyond it the lane is plain.
-        hatch_every: m.
-        hatch_taper: m across per metre along by which the hatching grows; 0: it fills the lane at once.
-        tram: strength of rails.
-        tram_across: m, middle of the track.
-        tram_bed: strength of the track's own bed.
-        tram_colour: (B, 3) linear reflectance of it.
-        tram_ballast: strength of its stones and sleepers.
+        hatching: of lanes.
+        tram: its track.
         manholes: probability of a cover in 16 m of a lane.
         cuts: probability of a sealed cut in 23 m of a lane.
         weeds: strength of weeds along the kerb.
@@ -92,19 +124,8 @@ class Street(NamedTuple):
     glyph: Tensor
     glyph_period: Tensor
     glyph_scale: Tensor
-    hatch: Tensor
-    hatch_width: Tensor
-    hatch_period: Tensor
-    hatch_slope: Tensor
-    hatch_chevron: Tensor
-    hatch_length: Tensor
-    hatch_every: Tensor
-    hatch_taper: Tensor
-    tram: Tensor
-    tram_across: Tensor
-    tram_bed: Tensor
-    tram_colour: Tensor
-    tram_ballast: Tensor
+    hatching: Hatching
+    tram: Tram
     manholes: Tensor
     cuts: Tensor
     weeds: Tensor
@@ -165,27 +186,41 @@ def sample_street(
         glyph=glyph,
         glyph_period=sampler.uniform(14, 60),
         glyph_scale=sampler.uniform(0.7, 1.3),
-        hatch=torch.where(hatched, sampler.uniform(0.7, 1.0, 1), 0.0),
-        hatch_width=sampler.uniform(0.25, 0.7),
-        hatch_period=sampler.uniform(1.4, 4.0),
-        hatch_slope=sampler.uniform(0.5, 2.5) * torch.where(sampler.chance(0.5), 1.0, -1.0),
-        hatch_chevron=sampler.chance(0.3).float(),
-        hatch_length=sampler.uniform(25, 120),
-        hatch_every=sampler.uniform(120, 300),
-        hatch_taper=sampler.sometimes(0.5, 0.03, 0.12),
-        tram=torch.where(track, sampler.uniform(0.5, 1.0), 0.0),
-        tram_across=torch.where(sampler.chance(0.65), 0.5 * (low + high), low - sampler.uniform(2.0, 4.5)),
-        tram_bed=sampler.sometimes(0.6, 0.4, 1.0),
-        tram_colour=torch.where(
-            sampler.chance(0.3, 1), sampler.pick_from(GREENS), sampler.uniform(0.06, 0.3, 1).expand(-1, 3)
-        ),
-        tram_ballast=sampler.sometimes(0.4, 0.4, 1.2),
+        hatching=_hatching(sampler, hatched),
+        tram=_tram(sampler, track, low, high),
         manholes=sampler.sometimes(0.6, 0.05, 0.4),
         cuts=sampler.sometimes(0.45, 0.1, 0.6),
         weeds=sampler.sometimes(0.5, 0.2, 1.0),
         paint=layout.colour.new_tensor(WHITE) * sampler.uniform(0.8, 1.1, 1),
         opacity=sampler.uniform(0.55, 1.0),
         wear=layout.wear[:, 0],
+    )
+
+
+def _hatching(sampler: BatchSampler, hatched: Tensor) -> Hatching:
+    """Sample hatching in some lanes (B, K)."""
+    return Hatching(
+        strength=torch.where(hatched, sampler.uniform(0.7, 1.0, 1), 0.0),
+        width=sampler.uniform(0.25, 0.7),
+        period=sampler.uniform(1.4, 4.0),
+        slope=sampler.uniform(0.5, 2.5) * torch.where(sampler.chance(0.5), 1.0, -1.0),
+        chevron=sampler.chance(0.3).float(),
+        length=sampler.uniform(25, 120),
+        every=sampler.uniform(120, 300),
+        taper=sampler.sometimes(0.5, 0.03, 0.12),
+    )
+
+
+def _tram(sampler: BatchSampler, track: Tensor, low: Tensor, high: Tensor) -> Tram:
+    """Sample tracks where there are some, (B,) bool, in or left of a lane from low to high, (B,) m."""
+    return Tram(
+        strength=torch.where(track, sampler.uniform(0.5, 1.0), 0.0),
+        across=torch.where(sampler.chance(0.65), 0.5 * (low + high), low - sampler.uniform(2.0, 4.5)),
+        bed=sampler.sometimes(0.6, 0.4, 1.0),
+        colour=torch.where(
+            sampler.chance(0.3, 1), sampler.pick_from(GREENS), sampler.uniform(0.06, 0.3, 1).expand(-1, 3)
+        ),
+        ballast=sampler.sometimes(0.4, 0.4, 1.2),
     )
 
 
@@ -222,20 +257,14 @@ def _glyphs(sampler: BatchSampler, layout: Layout, ego_lane: Tensor) -> Tensor:
     return torch.where(signed & lane_in & sampler.chance(0.75, slots), glyph, -1)
 
 
-def no_street(sampler: BatchSampler) -> Street:
-    """Return an empty street for B worlds."""
-    layoutless = torch.zeros_like
-    zero = sampler.uniform(0.0, 0.0)
-    two, slots = zero[:, None].repeat(1, 2), zero[:, None].repeat(1, MAX_BOUNDARIES)
-    whole, colour = layoutless(zero, dtype=torch.long), zero[:, None].repeat(1, 3)
-    fields = {name: zero for name in Street._fields}
-    fields |= {"own": whole, "first": whole, "crossing": whole, "hatch": slots}
-    fields |= {"glyph": torch.full_like(slots, -1, dtype=torch.long)}
-    fields |= {"strip": layoutless(two, dtype=torch.long), "paint": colour, "tram_colour": colour}
-    fields |= {name: two for name in ("strip_opacity", "bay", "kerb_height", "kerb_shade", "path_line")}
-    fields |= {"strip_colour": zero[:, None, None].repeat(1, 2, 3)}
-    fields |= {"strips": zero[:, None, None].repeat(1, 2, 4)}
-    fields |= {"colours": zero[:, None, None, None].repeat(1, 2, 4, 3)}
-    fields |= {name: zero + 100.0 for name in ("junction_period", "glyph_period", "hatch_every")}
-    fields |= {name: zero + 1.0 for name in ("glyph_scale", "hatch_period", "hatch_width")}
-    return Street(**fields)
+def no_street(street: Street) -> Street:
+    """Return an empty street for each of the worlds of these."""
+    empty: Street = map_tensors(torch.zeros_like, street)
+    one = torch.ones_like(empty.phase)
+    return empty._replace(
+        glyph=empty.glyph - 1,
+        glyph_scale=one,
+        glyph_period=100 * one,
+        junction_period=100 * one,
+        hatching=empty.hatching._replace(width=one, period=one, every=100 * one),
+    )

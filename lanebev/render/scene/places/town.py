@@ -123,7 +123,7 @@ def city_traffic(
     speed, valid = traffic.speed.clone(), traffic.valid.clone()
     pace = sampler.uniform(_COMING - 8, _COMING, NUM_VEHICLES)
     speed[:, :NUM_VEHICLES] = torch.where(coming, pace, speed[:, :NUM_VEHICLES])
-    valid[:, :NUM_VEHICLES] &= ~((street.hatch.gather(1, lane) > 0) & city[:, None])
+    valid[:, :NUM_VEHICLES] &= ~((street.hatching.strength.gather(1, lane) > 0) & city[:, None])
     gantries = slice(traffic.along.shape[1] - 10, traffic.along.shape[1] - 7)
     valid[:, gantries] &= ~(city & sampler.chance(0.8))[:, None]
     moving = traffic._replace(speed=speed, valid=valid)
