@@ -93,7 +93,7 @@ def test_a_highway_takes_no_number_from_the_sequence_for_other_kinds() -> None:
 
 @pytest.mark.parametrize("seed", [0, 1])
 def test_a_streets_own_paint_and_kerbs_change_the_image_and_no_label(seed: int) -> None:
-    plain = seen("city", seed, street=no_street(sampler_of(3, 0)))
+    plain = seen("city", seed, street=no_street(sample_world(sampler_of(3, 0), "city")[0].street))
     street = seen("city", seed)
     assert (street.image - plain.image).abs().amax((1, 2, 3)).min() > 0.02
     for name in ("boundaries", "painted", "visible", "lane_width", "offset"):
