@@ -67,6 +67,7 @@ def bare_world(sampler: BatchSampler, kind: str = "highway") -> tuple[World, tor
         weather=weather,
         bridge=bridge,
     )
+    sampler.uniform(0, 1)  # for nothing: what is drawn after it stays as it was
     return world._replace(shade=none, street=no_street(world.street)), ego_lane
 
 
