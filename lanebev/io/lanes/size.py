@@ -84,7 +84,10 @@ def lanes_of_whole_images(
             f"lanes crop: expected a part of the {image_size[1]} x {image_size[0]} px, got {width} x "
             f"{height} at {left}, {top}"
         )
-    resized = resized_lanes(frames, size or (height, width), (height, width))
+    drawn_on = size or (height, width)
+    if doubt := _doubt_of_size(frames, drawn_on):
+        raise ValueError(f"lanes, by --lanes-size and --lanes-crop: {doubt.words} leave out what is wrong")
+    resized = resized_lanes(frames, drawn_on, (height, width))
     return [_moved(frame, np.ones(2), np.array([left, top], dtype=np.float64)) for frame in resized]
 
 

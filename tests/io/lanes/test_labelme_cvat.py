@@ -58,6 +58,10 @@ def test_the_size_that_a_file_states_is_compared_with_that_of_the_images(tmp_pat
     assert size_remark(frames, (720, 1280)) == ""
     with pytest.raises(ValueError, match=r"got 1280 x 720 in the file; state .* --lanes-size 1280x720"):
         size_remark(frames, (710, 1280))
+    with pytest.raises(
+        ValueError, match="images of 640 x 360 px, got 1280 x 720 in the file; leave out what"
+    ):
+        lanes_of_whole_images(frames, (360, 640), None, (710, 1280))
     (frame,) = lanes_of_whole_images(frames, (720, 1280), None, (710, 1280))
     np.testing.assert_allclose(frame.lines[0].points[1], [400.0, 500.5 * 71 / 72 - 0.5])
     assert size_remark([frame], (710, 1280)) == ""
