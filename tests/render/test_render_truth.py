@@ -52,7 +52,8 @@ def bare_world(sampler: BatchSampler, kind: str = "highway") -> tuple[World, tor
         gutter_width=torch.zeros_like(pavement.gutter_width),
         lane_tone=torch.ones_like(pavement.lane_tone),
     )
-    around = world.surroundings._replace(wall_kind=torch.zeros_like(world.surroundings.wall_kind))
+    walls = world.surroundings.walls
+    around = world.surroundings._replace(walls=walls._replace(kind=torch.zeros_like(walls.kind)))
     traffic = world.traffic._replace(valid=torch.zeros_like(world.traffic.valid))
     weather = world.weather._replace(
         kind=torch.ones_like(world.weather.kind), grey=none + 1, visibility=none + 1e7, wet=none

@@ -18,11 +18,11 @@ STEEPEST = 0.12  # sine of the lowest sun that casts shadows
 def shadow_lengths(around: Surroundings, light: Light) -> Tensor:
     """Compute how far walls' shadows reach towards the road, (B, W) m; 0 or less if they do not."""
     slant = light.sun[:, 0] / light.sun[:, 1].clamp(min=STEEPEST)  # sideways per metre of height
-    wall = torch.arange(around.wall_kind.shape[1], device=slant.device)
+    wall = torch.arange(around.walls.kind.shape[1], device=slant.device)
     side = (wall % 2) * 2 - 1
-    kind = around.wall_kind
+    kind = around.walls.kind
     casts = (kind != NOTHING) & (kind != SLOPE) & (light.direct > 0.02).any(1, keepdim=True)
-    return around.wall_height * slant[:, None] * side * casts
+    return around.walls.height * slant[:, None] * side * casts
 
 
 class KindRows(NamedTuple):
@@ -111,8 +111,8 @@ def features_of(scene: Scene) -> Features:
         return bool((strength != 0).any())
 
     around, kinds = world.surroundings, world.kinds
-    there = around.wall_kind != NOTHING
-    style = torch.where(around.wall_kind == TREES, (around.wall_seed * 97).long() % STYLES, 0)
+    there = around.walls.kind != NOTHING
+    style = torch.where(around.walls.kind == TREES, (around.walls.seed * 97).long() % STYLES, 0)
     return Features(
         sun=bool((scene.light.direct > 0.02).any()),
         headlight=some(scene.light.headlight),
@@ -144,7 +144,7 @@ def features_of(scene: Scene) -> Features:
         ),
         shading=[_rows(wall) for wall in (shadow_lengths(around, scene.light) > SHORTEST_SHADOW).unbind(1)],
         walls=there.nonzero().tolist(),
-        looks=torch.stack([around.wall_kind, style], dim=-1)[there].tolist(),
+        looks=torch.stack([around.walls.kind, style], dim=-1)[there].tolist(),
     )
 
 

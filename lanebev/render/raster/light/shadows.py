@@ -101,11 +101,11 @@ def _crown_shadow(seen: _Shaders, ground: Ground) -> Tensor:
 def _wall_shadow(wall: int, walls: _Walls, ground: Ground) -> Tensor:
     """Compute the share of the sun that a wall leaves."""
     around, length = walls.around, walls.length[:, wall, None]
-    kind, side = around.wall_kind[:, wall, None], 1.0 if wall % 2 else -1.0
+    kind, side = around.walls.kind[:, wall, None], 1.0 if wall % 2 else -1.0
     leafy = (kind == TREES) | (kind == HEDGE)
-    crowns = 0.55 + 0.2 * sample_line(ground.along / 60.0 + around.wall_seed[:, wall, None])
+    crowns = 0.55 + 0.2 * sample_line(ground.along / 60.0 + around.walls.seed[:, wall, None])
     reach = choose(leafy, length * crowns, length)
-    inward = (around.wall_across[:, wall, None] - ground.across) * side  # m from the wall's foot
+    inward = (around.walls.across[:, wall, None] - ground.across) * side  # m from the wall's foot
     soft = (0.05 + 0.04 * reach + ground.reach_across).clamp(min=0.01)
     shade = ((reach - inward) / soft + 0.5).clamp(0, 1) * (inward / ground.reach_across + 0.5).clamp(0, 1)
     shade = shade * as_float((kind != RAIL) | (inward > 0.45 * reach))

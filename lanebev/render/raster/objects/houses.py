@@ -5,7 +5,7 @@ from torch import Tensor
 
 from lanebev.render.raster.base.colour import colour as colour_of
 from lanebev.render.raster.base.noise import CLOUD, hash01, sample_noise, smoothstep
-from lanebev.render.scene.objects.surroundings import Wall
+from lanebev.render.scene.objects.surroundings import Walls
 
 _FLOOR = 3.1  # m
 
@@ -18,7 +18,7 @@ def _share(position: Tensor, length: Tensor | float, period: Tensor | float, foo
     return inside + (length / period - inside) * coarse
 
 
-def house_front(wall: Wall, along: Tensor, up: Tensor, footprint: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def house_front(wall: Walls, along: Tensor, up: Tensor, footprint: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Compute reflectance, coverage and lit windows of a row of houses.
 
     Args:
@@ -62,7 +62,7 @@ def house_front(wall: Wall, along: Tensor, up: Tensor, footprint: Tensor) -> tup
     return albedo.clamp(0.01, 0.85), covered, glass * lit * (1 - roof)
 
 
-def lit_windows(wall: Wall, along: Tensor, up: Tensor, footprint: Tensor) -> Tensor:
+def lit_windows(wall: Walls, along: Tensor, up: Tensor, footprint: Tensor) -> Tensor:
     """Compute the radiance of the windows of walls of houses at night, (B, 3, N)."""
     _, _, lit = house_front(wall, along, up, footprint)
     return (0.5 * wall.seed[:, None] * lit)[:, None] * colour_of(lit, 1.0, 0.8, 0.5)

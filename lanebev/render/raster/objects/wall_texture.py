@@ -14,11 +14,20 @@ from lanebev.render.raster.base.noise import (
 )
 from lanebev.render.raster.base.select import as_float, choose
 from lanebev.render.raster.objects.houses import house_front
-from lanebev.render.scene.objects.surroundings import CONCRETE, FENCE, HEDGE, HOUSES, RAIL, SLOPE, TREES, Wall
+from lanebev.render.scene.objects.surroundings import (
+    CONCRETE,
+    FENCE,
+    HEDGE,
+    HOUSES,
+    RAIL,
+    SLOPE,
+    TREES,
+    Walls,
+)
 
 
 def wall_texture(
-    wall: Wall, kind: int, style: int, along: Tensor, up: Tensor, footprint: Tensor
+    wall: Walls, kind: int, style: int, along: Tensor, up: Tensor, footprint: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Compute reflectance and coverage of walls of one kind.
 
@@ -44,7 +53,7 @@ def _below(top: Tensor, up: Tensor, footprint: Tensor) -> Tensor:
     return ((top - up) / footprint + 0.5).clamp(0, 1)
 
 
-def _concrete(wall: Wall, along: Tensor, up: Tensor, footprint: Tensor) -> tuple[Tensor, Tensor]:
+def _concrete(wall: Walls, along: Tensor, up: Tensor, footprint: Tensor) -> tuple[Tensor, Tensor]:
     """Draw panels with stains; some with a sloping, brighter foot."""
     height, toe = wall.height[:, None], wall.toe[:, None]
     panel = periodic_coverage(along, 0.03, 6.0, footprint)
@@ -61,7 +70,7 @@ def _standing(height: Tensor, up: Tensor, footprint: Tensor) -> Tensor:
     return (up / footprint + 0.5).clamp(0, 1) * _below(height, up, footprint)
 
 
-def _rail(wall: Wall, along: Tensor, up: Tensor, footprint: Tensor) -> tuple[Tensor, Tensor]:
+def _rail(wall: Walls, along: Tensor, up: Tensor, footprint: Tensor) -> tuple[Tensor, Tensor]:
     """Draw a beam on posts."""
     height = wall.height[:, None]
     below = _below(height, up, footprint)
@@ -73,7 +82,7 @@ def _rail(wall: Wall, along: Tensor, up: Tensor, footprint: Tensor) -> tuple[Ten
     return wall.colour[..., None] * shade[:, None], on_ground * torch.maximum(beam, post)
 
 
-def _fence(wall: Wall, along: Tensor, up: Tensor, footprint: Tensor) -> tuple[Tensor, Tensor]:
+def _fence(wall: Walls, along: Tensor, up: Tensor, footprint: Tensor) -> tuple[Tensor, Tensor]:
     """Draw panels between posts."""
     stain = sample_noise(CLOUD, along / 60.0 + wall.seed[:, None], up / 20.0)
     panel = periodic_coverage(along, 0.15, 5.0, footprint)
@@ -81,7 +90,7 @@ def _fence(wall: Wall, along: Tensor, up: Tensor, footprint: Tensor) -> tuple[Te
     return wall.colour[..., None] * shade[:, None], _standing(wall.height[:, None], up, footprint)
 
 
-def _slope(wall: Wall, along: Tensor, up: Tensor, footprint: Tensor) -> tuple[Tensor, Tensor]:
+def _slope(wall: Walls, along: Tensor, up: Tensor, footprint: Tensor) -> tuple[Tensor, Tensor]:
     """Draw an embankment with tufts and bushes."""
     seed = wall.seed[:, None]
     top = wall.height[:, None] * (0.75 + 0.3 * sample_line(along / 420.0 + seed).clamp(-1.5, 1.5))
@@ -91,13 +100,13 @@ def _slope(wall: Wall, along: Tensor, up: Tensor, footprint: Tensor) -> tuple[Te
     return wall.colour[..., None] * shade, _standing(top, up, footprint)
 
 
-def _houses(wall: Wall, along: Tensor, up: Tensor, footprint: Tensor) -> tuple[Tensor, Tensor]:
+def _houses(wall: Walls, along: Tensor, up: Tensor, footprint: Tensor) -> tuple[Tensor, Tensor]:
     """Draw house fronts."""
     return house_front(wall, along, up, footprint)[:2]
 
 
 def _foliage(
-    wall: Wall, kind: int, style: int, along: Tensor, up: Tensor, footprint: Tensor
+    wall: Walls, kind: int, style: int, along: Tensor, up: Tensor, footprint: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Draw a row of trees or bushes: crowns by noise on their outline, lit from above, with holes of sky."""
     height, seed = wall.height[:, None], wall.seed[:, None]

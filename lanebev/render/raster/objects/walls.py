@@ -17,7 +17,7 @@ from lanebev.render.raster.light.night import headlight_irradiance
 from lanebev.render.raster.objects.houses import lit_windows
 from lanebev.render.raster.objects.wall_texture import wall_texture
 from lanebev.render.rows import take_rows
-from lanebev.render.scene.objects.surroundings import FENCE, HEDGE, HOUSES, NUM_WALLS, TREES, Wall, walls_of
+from lanebev.render.scene.objects.surroundings import FENCE, HEDGE, HOUSES, NUM_WALLS, TREES, Walls
 from lanebev.render.scene.road.alignment import elevation_at, wall_hit, wall_table
 from lanebev.render.scene.world import Scene
 from lanebev.tensors import join_tensors
@@ -59,7 +59,7 @@ class WallRows(NamedTuple):
 
     row: Tensor
     kind: Tensor
-    wall: Wall
+    wall: Walls
 
 
 class WallColours(NamedTuple):
@@ -89,7 +89,7 @@ def add_walls(scene: Scene, view: View, canvas: Canvas, across: Tensor, features
     entries = sorted((*features.looks[i], *entry) for i, entry in enumerate(features.walls))
     kind, _, row, wall = torch.tensor(entries).to(canvas.depth.device, non_blocking=True).unbind(1)
     looks = [(entry[0], entry[1]) for entry in entries]
-    walls = walls_of(scene.world.surroundings, row, wall)
+    walls = Walls(*(part[row, wall] for part in scene.world.surroundings.walls))
     blocks, hits = _hits(scene, view, canvas, across, row, walls)
     if not len(blocks):
         return
@@ -105,7 +105,7 @@ def add_walls(scene: Scene, view: View, canvas: Canvas, across: Tensor, features
 
 
 def _hits(
-    scene: Scene, view: View, canvas: Canvas, across: Tensor, row: Tensor, walls: Wall
+    scene: Scene, view: View, canvas: Canvas, across: Tensor, row: Tensor, walls: Walls
 ) -> tuple[Blocks, WallHits]:
     """Compute where rays meet E walls (in scenes ``row``) before the ground."""
     height = scene.lens.extrinsics.height[row]
@@ -159,7 +159,7 @@ def _candidates(
     return ((sky & low) | (~sky & beyond)).any(0)
 
 
-def _textures(walls: Wall, blocks: Blocks, hits: WallHits, looks: list[tuple[int, int]]) -> WallColours:
+def _textures(walls: Walls, blocks: Blocks, hits: WallHits, looks: list[tuple[int, int]]) -> WallColours:
     """Compute colours of points on walls, sorted by their looks (kind, style), one look at a time."""
     parts = []
     for look, part in _parts(blocks, looks):

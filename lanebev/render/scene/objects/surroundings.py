@@ -17,16 +17,31 @@ GREENS = [
 EARTHS = [(0.30, 0.24, 0.12), (0.36, 0.28, 0.14), (0.25, 0.20, 0.14), (0.22, 0.20, 0.17), (0.10, 0.15, 0.05)]
 
 
-class Surroundings(NamedTuple):
-    """Beside a road, (B, W) unless said otherwise.
+class Walls(NamedTuple):
+    """Walls along roads, (B, W) each or, of some of several scenes, (E,); unless said otherwise.
 
     Attributes:
-        wall_across: m, place of each wall in the layout's frame.
-        wall_kind: int64, NOTHING, CONCRETE, RAIL, TREES, FENCE, SLOPE or HEDGE.
-        wall_height: m.
-        wall_colour: (B, W, 3) linear reflectance.
-        wall_seed: shifts the noise.
-        wall_toe: factor of a concrete barrier's sloping foot, which faces the sky; 1 is none.
+        across: m, place in the layout's frame.
+        kind: int64, NOTHING, CONCRETE, RAIL, TREES, FENCE, SLOPE, HEDGE or HOUSES.
+        height: m.
+        colour: (..., 3) linear reflectance.
+        seed: in [0, 1), shifts the noise.
+        toe: factor of a concrete barrier's sloping foot, which faces the sky; 1 is none.
+    """
+
+    across: Tensor
+    kind: Tensor
+    height: Tensor
+    colour: Tensor
+    seed: Tensor
+    toe: Tensor
+
+
+class Surroundings(NamedTuple):
+    """Beside a road.
+
+    Attributes:
+        walls: (B, W).
         verge: (B, 2, 3) linear reflectance of the ground beside the pavement, left and right.
         zenith: (B, 3) linear radiance of the sky.
         skyline: (B, 3) linear radiance at the horizon.
@@ -37,12 +52,7 @@ class Surroundings(NamedTuple):
         hill_colour: (B, 3).
     """
 
-    wall_across: Tensor
-    wall_kind: Tensor
-    wall_height: Tensor
-    wall_colour: Tensor
-    wall_seed: Tensor
-    wall_toe: Tensor
+    walls: Walls
     verge: Tensor
     zenith: Tensor
     skyline: Tensor
@@ -51,37 +61,6 @@ class Surroundings(NamedTuple):
     opposite_colour: Tensor
     hill_height: Tensor
     hill_colour: Tensor
-
-
-class Wall(NamedTuple):
-    """E walls of several scenes, (E,) each unless said otherwise; see :class:`Surroundings`.
-
-    Attributes:
-        across: m.
-        height: m.
-        colour: (E, 3).
-        seed: in [0, 1).
-        toe: factor.
-    """
-
-    across: Tensor
-    height: Tensor
-    colour: Tensor
-    seed: Tensor
-    toe: Tensor
-
-
-def walls_of(surroundings: Surroundings, row: Tensor, wall: Tensor) -> Wall:
-    """Select some walls of some scenes.
-
-    Args:
-        surroundings: B of them.
-        row: (E,) int64, the scene.
-        wall: (E,) int64, which of its walls.
-    """
-    s = surroundings
-    fields = (s.wall_across, s.wall_height, s.wall_colour, s.wall_seed, s.wall_toe)
-    return Wall(*(field[row, wall] for field in fields))
 
 
 def sample_surroundings(
@@ -102,12 +81,14 @@ def sample_surroundings(
     zenith, skyline = _sky(sampler, grey[:, None])
     verge = torch.where(sampler.chance(0.5, 1, 1), sampler.pick_from(GREENS, 2), sampler.pick_from(EARTHS, 2))
     return Surroundings(
-        wall_across=across,
-        wall_kind=kind,
-        wall_height=height,
-        wall_colour=colour,
-        wall_seed=sampler.uniform(0, 1, NUM_WALLS),
-        wall_toe=sampler.sometimes(0.6, 1.1, 3.0, NUM_WALLS, otherwise=1.0),
+        walls=Walls(
+            across=across,
+            kind=kind,
+            height=height,
+            colour=colour,
+            seed=sampler.uniform(0, 1, NUM_WALLS),
+            toe=sampler.sometimes(0.6, 1.1, 3.0, NUM_WALLS, otherwise=1.0),
+        ),
         verge=verge * sampler.uniform(0.7, 1.3, 1, 1),
         zenith=zenith,
         skyline=skyline,

@@ -102,10 +102,12 @@ def country_surroundings(
     )
     colour = torch.where((kind == RAIL)[..., None], sampler.uniform(0.1, 0.4, NUM_WALLS, 1), colour)
     fields = around._replace(
-        wall_across=edge + gap * gap.new_tensor([-1.0, 1.0] * 3),
-        wall_kind=kind,
-        wall_height=height,
-        wall_colour=colour * sampler.uniform(0.7, 1.3, NUM_WALLS, 1),
+        walls=around.walls._replace(
+            across=edge + gap * gap.new_tensor([-1.0, 1.0] * 3),
+            kind=kind,
+            height=height,
+            colour=colour * sampler.uniform(0.7, 1.3, NUM_WALLS, 1),
+        ),
         opposite=torch.full_like(around.opposite, -math.inf),
     )
     return select_rows(country, fields, around)

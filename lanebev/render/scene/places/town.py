@@ -102,10 +102,9 @@ def street_surroundings(
     )  # grass, or as the walk
     town = around._replace(
         verge=ground * sampler.uniform(0.6, 1.2, 2, 1),
-        wall_across=across,
-        wall_kind=kind,
-        wall_height=height,
-        wall_colour=torch.where(green, leaves, plaster),
+        walls=around.walls._replace(
+            across=across, kind=kind, height=height, colour=torch.where(green, leaves, plaster)
+        ),
         opposite=opposite,
         hill_height=around.hill_height.clamp(max=0.03),
     )

@@ -77,14 +77,16 @@ def tunnel_surroundings(
     edge = torch.stack([pavement.left, pavement.right], 1).repeat(1, 3)
     gap = torch.cat([sampler.uniform(30, 31, 4), sampler.uniform(0.1, 1.0, 2)], 1)
     near = torch.arange(NUM_WALLS, device=tunnel.device) >= NUM_WALLS - 2
+    colour = sampler.uniform(0.05, 0.5, 1, 1) * (1 + sampler.normal(0.06, 1, 3))
+    walls = around.walls._replace(
+        across=edge + gap * gap.new_tensor([-1.0, 1.0] * 3),
+        kind=torch.where(near, CONCRETE, NOTHING).expand_as(around.walls.kind),
+        height=(inside.ceiling[:, None] + 0.15).expand_as(around.walls.height),
+        colour=colour.expand_as(around.walls.colour),
+        toe=torch.ones_like(around.walls.toe),
+    )
     walled = around._replace(
-        wall_across=edge + gap * gap.new_tensor([-1.0, 1.0] * 3),
-        wall_kind=torch.where(near, CONCRETE, NOTHING).expand_as(around.wall_kind),
-        wall_height=(inside.ceiling[:, None] + 0.15).expand_as(around.wall_height),
-        wall_colour=(sampler.uniform(0.05, 0.5, 1, 1) * (1 + sampler.normal(0.06, 1, 3))).expand_as(
-            around.wall_colour
-        ),
-        wall_toe=torch.ones_like(around.wall_toe),
+        walls=walls,
         verge=pavement.base[:, None].expand(-1, 2, -1),
         opposite=torch.full_like(around.opposite, -math.inf),
     )
