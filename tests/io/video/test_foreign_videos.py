@@ -18,6 +18,7 @@ from lanebev.io.lanes.parsing import FrameLines
 from lanebev.io.opening import open_source
 
 SIZE = (48, 64)
+MILLISECOND = Fraction(1, 1000)
 
 
 def _stream(container, size=SIZE, codec="libx264", rate=10, fmt="yuv420p"):
@@ -33,6 +34,17 @@ def _write(container, stream, times, tick=Fraction(1, 10)):
         frame.pts, frame.time_base = pts, tick
         container.mux(stream.encode(frame))
     container.mux(stream.encode())
+
+
+def _source(path, times, tick=Fraction(1, 10), own_tick=None, metadata=(), **options):
+    """Write a video of one stream, whose codec may have a tick of its own too, and open it."""
+    with av.open(str(path), "w") as container:
+        stream = _stream(container, **options)
+        stream.metadata.update(metadata)
+        if own_tick is not None:
+            stream.codec_context.time_base = own_tick
+        _write(container, stream, times, tick)
+    return open_source(str(path))
 
 
 def _levels(source):
@@ -91,10 +103,7 @@ def test_a_video_of_covers_only_is_none(tmp_path):
 
 
 def test_a_frame_rate_that_the_times_belie(tmp_path):  # picamera#541
-    path = tmp_path / "v.mkv"
-    with av.open(str(path), "w") as container:
-        _write(container, _stream(container, rate=1000), range(0, 1200, 100), Fraction(1, 1000))
-    source = open_source(str(path))
+    source = _source(tmp_path / "v.mkv", range(0, 1200, 100), MILLISECOND, rate=1000)
     assert source.fps == 10
     assert source.problem.endswith("v.mkv: it states 1000 frames per second, they come at 10")
     np.testing.assert_allclose([frame.dt for frame in source], 0.1, atol=1e-3)
@@ -102,10 +111,7 @@ def test_a_frame_rate_that_the_times_belie(tmp_path):  # picamera#541
 
 @pytest.mark.parametrize("times", [[0, 1, 2, 3, 9, 10, 11, 30], [0, 1, 2, 3, 4, 5000, 5001, 5002]])
 def test_gaps_do_not_make_the_stated_rate_wrong(tmp_path, times):
-    path = tmp_path / "v.mkv"
-    with av.open(str(path), "w") as container:
-        _write(container, _stream(container), times)
-    source = open_source(str(path))
+    source = _source(tmp_path / "v.mkv", times)
     assert source.fps == 10
     assert "frames per second" not in source.problem
     np.testing.assert_allclose([frame.time for frame in source], np.array(times) / 10, atol=1e-3)
@@ -114,12 +120,7 @@ def test_gaps_do_not_make_the_stated_rate_wrong(tmp_path, times):
 @pytest.mark.parametrize("times", [[0, 58, 91, 150, 200, 270, 290, 333], [0, 33, 66, 4000, 4033, 4066, 4100]])
 @pytest.mark.parametrize("suffix", ["mkv", "mp4"])
 def test_the_number_of_frames_that_are_taken_is_exact_where_times_vary(tmp_path, times, suffix):
-    path = tmp_path / f"v.{suffix}"
-    with av.open(str(path), "w") as container:
-        stream = _stream(container, rate=30)
-        stream.codec_context.time_base = Fraction(1, 1000)
-        _write(container, stream, times, Fraction(1, 1000))
-    source = open_source(str(path))
+    source = _source(tmp_path / f"v.{suffix}", times, MILLISECOND, MILLISECOND, rate=30)
     np.testing.assert_allclose([frame.time for frame in source], np.array(times) / 1000, atol=1e-9)
     for start, end, every in ((0.06, 0.3, 1), (0.0, 4.04, 2), (0.1, 3.9, 1), (0.25, math.inf, 3)):
         part = replace(source, selection=Selection(start, end, every))
@@ -141,12 +142,8 @@ def _cut(path, out, packets):
 
 
 def test_an_edit_list_that_begins_within_a_frame_is_no_cut(tmp_path):  # as phones trim
-    path = tmp_path / "v.mp4"
-    with av.open(str(path), "w") as container:
-        stream = _stream(container, rate=30)
-        stream.codec_context.time_base = Fraction(1, 1000)
-        _write(container, stream, [-100 + 33 * i for i in range(20)], Fraction(1, 1000))
-    source = open_source(str(path))
+    times = [-100 + 33 * i for i in range(20)]
+    source = _source(tmp_path / "v.mp4", times, MILLISECOND, MILLISECOND, rate=30)
     assert (_levels(source), source.count, source.problem) == (list(range(4, 20)), 16, "")
 
 
@@ -201,19 +198,14 @@ def test_interlaced_frames_are_said(tmp_path):
 
 
 def test_frames_of_two_cameras_are_said(tmp_path):
-    path = tmp_path / "v.mkv"
-    with av.open(str(path), "w") as container:
-        stream = _stream(container)
-        stream.metadata["stereo_mode"] = "left_right"
-        _write(container, stream, range(4))
-    assert "its header says that frames have the images of two cameras" in open_source(str(path)).problem
+    source = _source(tmp_path / "v.mkv", range(4), metadata={"stereo_mode": "left_right"})
+    assert "its header says that frames have the images of two cameras" in source.problem
 
 
 def test_videos_of_360_degrees_are_said(tmp_path):
     """Google's box for spherical videos, as cameras and YouTube's injector write it into the track."""
     path = tmp_path / "v.mp4"
-    with av.open(str(path), "w") as container:
-        _write(container, _stream(container), range(4))
+    _source(path, range(4))
     words = b"<GSpherical:Spherical>true<GSpherical:Stitched>true<GSpherical:StitchingSoftware>"
     words += b"<GSpherical:ProjectionType>equirectangular"
     box = bytes.fromhex("ffcc8263f8554a938814587a02521fdd") + words
@@ -231,8 +223,7 @@ def _joined(path, parts):
     """Write videos that begin at some times (0.1 s), one byte by byte behind the other."""
     data = b""
     for times in parts:
-        with av.open(str(path), "w") as container:
-            _write(container, _stream(container), times)
+        _source(path, times)
         data += path.read_bytes()
     path.write_bytes(data)
     return open_source(str(path))
@@ -303,20 +294,14 @@ def test_times_rounded_to_the_same_tick_do_not_begin_again(tmp_path):  # Matrosk
 
 def test_a_transport_stream_of_varying_times_states_no_rate(tmp_path):
     tick = Fraction(1, 90_000)
-    with av.open(str(tmp_path / "v.ts"), "w") as container:
-        stream = _stream(container, rate=25)
-        stream.codec_context.time_base = tick
-        _write(container, stream, [3000 * i + i % 3 * 450 for i in range(24)], tick)
-    source = open_source(str(tmp_path / "v.ts"))
+    times = [3000 * i + i % 3 * 450 for i in range(24)]
+    source = _source(tmp_path / "v.ts", times, tick, tick, rate=25)
     assert (len(list(source)), source.problem) == (24, "")
 
 
 @pytest.mark.parametrize("suffix", ["mp4", "mkv"])
 def test_a_gap_of_hours_is_said_and_changes_no_frame_rate(tmp_path, suffix):
-    path = tmp_path / f"v.{suffix}"
-    with av.open(str(path), "w") as container:
-        _write(container, _stream(container), [*range(6), *range(72_000, 72_006)])
-    source = open_source(str(path))
+    source = _source(tmp_path / f"v.{suffix}", [*range(6), *range(72_000, 72_006)])
     assert "its times jump by 7200 s; is it one drive?" in source.problem
     assert source.fps == 10
     assert source.times[6] == pytest.approx(7200)
