@@ -1,6 +1,7 @@
 """Coefficients of a lens that a file states one by one, under names such as k1 and p1."""
 
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 from lanebev.camera.parsing import given_keys, number, numbers
@@ -12,6 +13,10 @@ LENS_NAMES = {
 }
 """OpenCV's order of the coefficients of each model."""
 
+_LIKE_LENS = re.compile(  # with words before it, but "undistorted" is none
+    r"([a-z]+_)*?(dist(?!ance|ribut|.*(model|type|std))|radial|tangential|[kp][1-6]$)|D$", re.IGNORECASE
+)
+_BEFORE_DIST = re.compile(r"([a-z]+_)+dist", re.IGNORECASE)  # of one number it is a distance
 _USUAL = 5  # coefficients of a pinhole camera without the rational model's k4, k5 and k6
 
 
@@ -58,3 +63,28 @@ def stated_lens(fields: Mapping[str, Any], keys: Sequence[str], model: str) -> l
     if unknown := [key for key in below if key not in LENS_NAMES["pinhole"]]:
         raise ValueError(f"{lists[0]}: expected k1, k2, p1, p2, k3, got the key {shown(unknown[0])}")
     return named_lens(below, model)
+
+
+def check_lens_keys(fields: Mapping[str, Any], known: Collection[str]) -> None:
+    """Raise if a lens is stated under a name that is not known, so that it would not count.
+
+    Args:
+        fields: fields of a camera.
+        known: keys of its lens.
+    """
+    for key, value in fields.items():
+        is_other = _BEFORE_DIST.match(key) and not isinstance(value, list | Mapping)
+        if key not in known and _LIKE_LENS.match(key) and not is_other and _has_number(value):
+            raise ValueError(
+                f"distortion: expected k1 k2 p1 p2 k3 under a known key, got {shown(key)}; rename it"
+            )
+
+
+def _has_number(value: Any) -> bool:
+    """Tell whether a value is, or contains, a number other than 0."""
+    if isinstance(value, list | Mapping):
+        return any(map(_has_number, value.values() if isinstance(value, Mapping) else value))
+    try:
+        return float(value) != 0.0
+    except (TypeError, ValueError):
+        return False

@@ -6,7 +6,7 @@ from functools import partial
 from typing import Any
 
 from lanebev.camera.choice import Readers
-from lanebev.camera.named_lens import named_lens
+from lanebev.camera.named_lens import LENS_NAMES, check_lens_keys, named_lens
 from lanebev.camera.parameters import CameraParameters, matrix_entries
 from lanebev.camera.parsing import given_keys, mapping, number, numbers, required, stated_size, whole_number
 from lanebev.numbers import shown
@@ -65,6 +65,7 @@ def nerf(fields: Mapping[str, Any]) -> CameraParameters:
         raise ValueError(f"camera_model: expected one of {', '.join(_NERF_MODELS)}, got {shown(name)}")
     is_fisheye = str(fields.get("is_fisheye")).lower() == "true"
     model = "fisheye" if is_fisheye else _NERF_MODELS[name]
+    check_lens_keys(fields, LENS_NAMES["pinhole"])
     fx, cx, cy = (number(fields, key) for key in ("fl_x", "cx", "cy"))
     matrix = matrix_entries(fx, number(fields, "fl_y", default=fx), cx - 0.5, cy - 0.5)
     return CameraParameters(matrix, named_lens(fields, model), model, stated_size(fields, "h", "w"))
@@ -73,6 +74,7 @@ def nerf(fields: Mapping[str, Any]) -> CameraParameters:
 def realsense(fields: Mapping[str, Any]) -> CameraParameters:
     """Read the intrinsics of Intel's librealsense: JSON, YAML, or what ``rs-enumerate-devices -c`` prints."""
     fields = {key.lower(): value for key, value in fields.items()}
+    check_lens_keys(fields, ("coeffs", "distortion"))
     distortion = numbers(fields, "coeffs") if fields.get("coeffs") is not None else []
     stated = str(fields.get("model") or fields.get("distortion") or "none")
     name = re.sub(r"[\W_]", "", stated.lower().removeprefix("distortion."))
@@ -80,6 +82,8 @@ def realsense(fields: Mapping[str, Any]) -> CameraParameters:
         raise ValueError(
             f"model: expected brown_conrady, or coeffs of zeros, got {shown(stated)}; calibrate by OpenCV"
         )
+    if name != "none" and not distortion:
+        raise ValueError(f"coeffs: expected the coefficients of {shown(stated)}, got none; add the entry")
     fx, fy, cx, cy = (number(fields, key) for key in ("fx", "fy", "ppx", "ppy"))
     return CameraParameters(matrix_entries(fx, fy, cx, cy), distortion, "pinhole", stated_size(fields))
 
@@ -119,6 +123,7 @@ def metashape(fields: Mapping[str, Any]) -> CameraParameters:
     if name != "frame" or unfit:
         got = unfit[0] if unfit else shown(name)
         raise ValueError(f"projection: expected frame with k1 k2 k3 p1 p2, got {got}; export it as OpenCV's")
+    check_lens_keys(fields, ("k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4"))
     width, height = whole_number(fields, "width"), whole_number(fields, "height")
     focal = number(fields, "f")
     cx, cy, b1, b2, k1, k2, k3, p1, p2 = (

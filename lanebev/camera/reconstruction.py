@@ -5,7 +5,7 @@ from functools import partial
 from typing import Any
 
 from lanebev.camera.choice import Readers
-from lanebev.camera.named_lens import named_lens
+from lanebev.camera.named_lens import LENS_NAMES, check_lens_keys, named_lens
 from lanebev.camera.parameters import CameraParameters, matrix_entries
 from lanebev.camera.parsing import mapping, number, numbers, required, stated_size
 from lanebev.numbers import shown
@@ -40,6 +40,7 @@ def _opensfm(fields: Mapping[str, Any]) -> CameraParameters:
     name = str(fields["projection_type"]).strip().lower()
     if name not in _OPENSFM_MODELS:
         raise ValueError(f"projection_type: expected one of {', '.join(_OPENSFM_MODELS)}, got {shown(name)}")
+    check_lens_keys(fields, LENS_NAMES["pinhole"])
     model, size = _OPENSFM_MODELS[name], stated_size(fields)
     fx, fy = (
         number(fields, key if fields.get(key) is not None else "focal") for key in ("focal_x", "focal_y")
@@ -70,6 +71,7 @@ def _openmvg(entry: Mapping[str, Any]) -> CameraParameters:
     value = mapping("value", required(entry, "value"))
     fields = mapping("data", mapping("ptr_wrapper", required(value, "ptr_wrapper")).get("data"))
     fields = {**fields, **mapping("value0", fields.get("value0") or {})}
+    check_lens_keys(fields, _OPENMVG_LENSES)
     size = stated_size(fields)
     focal, (cx, cy) = number(fields, "focal_length"), numbers(fields, "principal_point", count=2)
     model, distortion = "pinhole", [0.0] * 5

@@ -3,7 +3,6 @@
 Each is a record with the camera matrix under a name of the data set's or the program's own.
 """
 
-import re
 from collections.abc import Mapping
 from contextlib import suppress
 from functools import partial
@@ -12,7 +11,7 @@ from typing import Any, NamedTuple
 from lanebev.camera.choice import Readers, telling_names
 from lanebev.camera.datasets import is_woodscape, woodscape
 from lanebev.camera.formats import DISTORTION_KEYS, stated_model, with_sides
-from lanebev.camera.named_lens import LENS_NAMES, stated_lens
+from lanebev.camera.named_lens import LENS_NAMES, check_lens_keys, stated_lens
 from lanebev.camera.parameters import (
     OFF_CENTRE,
     CameraParameters,
@@ -21,7 +20,6 @@ from lanebev.camera.parameters import (
     size_of_images,
 )
 from lanebev.camera.parsing import camera_matrix, given_keys, listed_size, number, whole_number
-from lanebev.numbers import shown
 
 Record = Mapping[str, Any]
 
@@ -58,10 +56,6 @@ _LAYOUTS = (
 )
 _CITYSCAPES = _Layout("Cityscapes'", "intrinsic", (1024, 2048))  # by numbers with names
 _LENS_KEYS = (*DISTORTION_KEYS, "camera_distortion", "camera_dist_coeffs", "Distortion", "cam_D", "DistCoeff")
-_LIKE_LENS = re.compile(  # with words before it, but "undistorted" is none
-    r"([a-z]+_)*?(dist(?!ance|ribut|.*(model|type|std))|radial|tangential|[kp][1-6]$)", re.IGNORECASE
-)
-_BEFORE_DIST = re.compile(r"([a-z]+_)+dist", re.IGNORECASE)  # of one number it is a distance
 _PLACES = ("calib", "cameras")  # keys below which ONCE and A2D2 have their cameras
 
 
@@ -101,17 +95,6 @@ def _named_numbers(record: Record) -> Record | None:
     return next((each for each in found if isinstance(each, Mapping) and "fx" in each), None)
 
 
-def _check_lens_keys(record: Record) -> None:
-    """Raise if a lens is stated under a name that is not known, so that it would not count."""
-    for key, value in record.items():
-        known = key in (*_LENS_KEYS, *LENS_NAMES["pinhole"])
-        is_other = _BEFORE_DIST.match(key) and not isinstance(value, list | Mapping)
-        if value and not known and _LIKE_LENS.match(key) and not is_other:
-            raise ValueError(
-                f"distortion: expected k1 k2 p1 p2 k3 under this key, got {shown(key)}; rename it"
-            )
-
-
 def _read(record: Record, image_size: tuple[int, int] | None, rectified: bool) -> CameraParameters:
     """Read a record; the lens beside the matrix counts, under any of its names."""
     layout = _layout(record) or _LAYOUTS[0]
@@ -127,9 +110,11 @@ def _read(record: Record, image_size: tuple[int, int] | None, rectified: bool) -
         if _is_waymos(matrix):
             record = {**record, "distortion": matrix[4:]}
             matrix = matrix_entries(*matrix[:4])
-    _check_lens_keys(record)
+    check_lens_keys(record, (*_LENS_KEYS, *LENS_NAMES["pinhole"]))
     model = "fisheye" if record.get("Lens") == "Fisheye" else stated_model(record, layout.model)
     distortion = stated_lens(record, _LENS_KEYS, model)
+    if model == "fisheye" and not distortion:
+        raise ValueError("distortion: expected the coefficients of a fisheye, got none; add the entry")
     return CameraParameters(matrix, distortion, model, _size(matrix, record, image_size, layout))
 
 

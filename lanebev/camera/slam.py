@@ -7,6 +7,7 @@ from typing import Any
 
 from lanebev.camera.approximation import Array, double_sphere, extended_unified, fov_model, radial_camera
 from lanebev.camera.choice import Readers
+from lanebev.camera.named_lens import check_lens_keys
 from lanebev.camera.parameters import CameraParameters, matrix_entries
 from lanebev.camera.parsing import listed_size, mapping, number, numbers, required, stated_size, whole_number
 from lanebev.numbers import shown
@@ -81,6 +82,7 @@ def _of_basalt(camera: Any, size: Any) -> Mapping[str, Any]:
 
 def _of_maplab(entry: Mapping[str, Any]) -> Mapping[str, Any]:
     camera = mapping("camera", required(entry, "camera"))
+    check_lens_keys(camera, ("distortion",))
     lens = mapping("distortion", camera.get("distortion") or {})
     return {
         "camera_model": required(camera, "type"),
@@ -130,6 +132,7 @@ def _kalibr(fields: Mapping[str, Any]) -> CameraParameters:
     model = _KALIBR_MODELS[names]
     intrinsics = numbers(fields, "intrinsics", count=5 if model == "omni" else 4)
     coefficients = ("distortion_coeffs", "distortion_coefficients")
+    check_lens_keys(fields, coefficients)
     distortion = [0.0] * 4
     if names[1] != "none":
         distortion = numbers(fields, *coefficients, count=None if model == "pinhole" else 4)
@@ -217,6 +220,11 @@ def _orb_slam(fields: Mapping[str, Any], of: str) -> CameraParameters:
         raise ValueError(f"Camera.type: expected one of {', '.join(_ORB_SLAM_MODELS)}, got {shown(kind)}")
     model, names = _ORB_SLAM_MODELS[kind.lower()]
     fx, fy, cx, cy = (number(fields, of + key) for key in ("fx", "fy", "cx", "cy"))
+    for start in (
+        {"Camera.", of} if names else ()
+    ):  # the second of a stereo camera's, which has some keys for both
+        own = {key.removeprefix(start): value for key, value in fields.items() if key.startswith(start)}
+        check_lens_keys(own, (*names.split(), "k4") if start == of else ())
     given = [of + key for key in names.split()]
     distortion = [number(fields, key, default=0.0) for key in given]
     if model == "pinhole" and fields.get(of + "k4") is not None and number(fields, of + "k4"):

@@ -190,15 +190,18 @@ def test_rectified_images_of_a2d2_have_a_matrix_of_their_own(tmp_path):
         ),
         (
             {**LIKE_OPENLANE, "dist_koeffs": LENS},
-            "expected k1 .* under this key, got 'dist_koeffs'; rename it",
+            "expected k1 .* under a known key, got 'dist_koeffs'; rename it",
         ),
         (
             {**LIKE_OPENLANE, "cam_dist_coefs": LENS},
-            "expected k1 .* under this key, got 'cam_dist_coefs'; rename it",
+            "expected k1 .* under a known key, got 'cam_dist_coefs'; rename it",
         ),
         ({**LIKE_OPENLANE, "k4": -0.3}, r"k4: expected no such coefficient of a pinhole lens, got -0.3"),
         ({**LIKE_OPENLANE, "k1": -0.3, "p1": 0.1, "model": "fisheye"}, "p1: expected no such coefficient"),
-        ({**LIKE_OPENLANE, "radial_distortion": [0.1]}, "under this key, got 'radial_distortion'; rename it"),
+        (
+            {**LIKE_OPENLANE, "radial_distortion": [0.1]},
+            "under a known key, got 'radial_distortion'; rename it",
+        ),
         (
             {**NERF, "camera_model": "EQUIRECTANGULAR"},
             "camera_model: expected one of OPENCV, .* 'EQUIRECTANGULAR'",
@@ -311,3 +314,52 @@ def test_results_of_opencvs_python_tutorial_are_read_for_images_of_a_given_size(
     np.savez(tmp_path / "c.npz", **content, width=1280, height=720)
     camera = Camera.from_file(tmp_path / "c.npz", image_size=(1080, 1920))
     assert (camera.image_size, camera.remark) == ((720, 1280), "")
+
+
+MVG = {
+    "width": 1280,
+    "height": 720,
+    "focal_length": 900,
+    "principal_point": [640, 360],
+    "disto_K3": [-0.3, 0, 0],
+}
+
+
+@pytest.mark.parametrize(
+    ("text", "key"),
+    [
+        (json.dumps({**REALSENSE, "model": "brown_conrady", "distortion_coeffs": LENS}), "distortion_coeffs"),
+        (json.dumps({**NERF, "distortion_params": LENS}), "distortion_params"),
+        (json.dumps({"v2": {"projection_type": "brown", "focal": 1, "dist": LENS}}), "dist"),
+        (
+            json.dumps(
+                {"sfm_data_version": "0.3", "intrinsics": [{"value": {"ptr_wrapper": {"data": MVG}}}]}
+            ),
+            "disto_K3",
+        ),
+        (METASHAPE.format("frame", "<K3>0.1</K3>"), "K3"),
+        ("cam0: {camera_model: pinhole, intrinsics: [9, 9, 6, 4], D: [-0.3, 0.1, 0, 0]}", "D"),
+        ("cameras: [{camera: {type: pinhole, distorsion: {parameters: [-0.3]}}}]", "distorsion"),
+        ("Camera1.fx: 9\nCamera1.fy: 9\nCamera1.cx: 6\nCamera1.cy: 4\nCamera.k1: -0.3\n", "k1"),
+    ],
+)
+def test_a_lens_under_an_unknown_key_is_not_left_out(tmp_path, text, key):
+    (tmp_path / "c.yaml").write_text(text)
+    with pytest.raises(ValueError, match=f"distortion: expected k1 .* known key, got '{key}'; rename it"):
+        Camera.from_file(tmp_path / "c.yaml")
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (
+            {**REALSENSE, "model": "brown_conrady"},
+            "coeffs: expected the coefficients of 'brown_conrady', got n",
+        ),
+        ({**ZOD_FRONT, "distortion": None}, "distortion: expected the coefficients of a fisheye, got none"),
+    ],
+)
+def test_a_lens_without_its_coefficients_is_no_ideal_one(tmp_path, content, message):
+    (tmp_path / "c.json").write_text(json.dumps(content))
+    with pytest.raises(ValueError, match=message):
+        Camera.from_file(tmp_path / "c.json")
