@@ -231,7 +231,7 @@ def _ordered_cameras(
     return stereo_cameras(fields, rectified, image_size)
 
 
-def camera_from_fields(fields: Mapping[str, Any], rectified: bool) -> CameraParameters:
+def camera_from_fields(fields: Mapping[str, Any], rectified: bool = False) -> CameraParameters:
     """Return the camera of the fields of a ROS ``camera_info``, as a message has them.
 
     Raises:
