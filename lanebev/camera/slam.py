@@ -71,6 +71,7 @@ def _of_basalt(camera: Any, size: Any) -> Mapping[str, Any]:
         raise ValueError(f"camera_type: expected one of {', '.join(_BASALT_MODELS)}, got {shown(name)}")
     *models, intrinsics, distortion = _BASALT_MODELS[name]
     values = mapping("intrinsics", required(camera, "intrinsics"))
+    check_lens_keys(values, distortion.split())
     return {
         "camera_model": models[0],
         "distortion_model": models[1],
@@ -171,7 +172,9 @@ def camodocal(fields: Mapping[str, Any]) -> CameraParameters:
         model, distortion = "fisheye", [number(projection, key) for key in ("k2", "k3", "k4", "k5")]
     elif name in ("PINHOLE", "MEI"):
         distorted = mapping("distortion_parameters", required(fields, "distortion_parameters"))
-        model, distortion = "pinhole", [number(distorted, key) for key in ("k1", "k2", "p1", "p2")]
+        names = ("k1", "k2", "p1", "p2")
+        check_lens_keys(distorted, names)
+        model, distortion = "pinhole", [number(distorted, key) for key in names]
         keys = ("fx", "fy", "cx", "cy")
         if name == "MEI":
             mirror = mapping("mirror_parameters", required(fields, "mirror_parameters"))

@@ -339,6 +339,15 @@ MVG = {
         ),
         (METASHAPE.format("frame", "<K3>0.1</K3>"), "K3"),
         ("cam0: {camera_model: pinhole, intrinsics: [9, 9, 6, 4], D: [-0.3, 0.1, 0, 0]}", "D"),
+        (
+            "value0: {intrinsics: [{camera_type: pinhole, intrinsics: {k1: -0.3}}], resolution: [[12, 8]]}",
+            "k1",
+        ),
+        (
+            "{model_type: PINHOLE, image_width: 12, image_height: 8, projection_parameters: {fx: 9}, "
+            "distortion_parameters: {k1: -0.3, k2: 0.1, p1: 0, p2: 0, k3: 0.05}}",
+            "k3",
+        ),
         ("cameras: [{camera: {type: pinhole, distorsion: {parameters: [-0.3]}}}]", "distorsion"),
         ("Camera1.fx: 9\nCamera1.fy: 9\nCamera1.cx: 6\nCamera1.cy: 4\nCamera.k1: -0.3\n", "k1"),
     ],
