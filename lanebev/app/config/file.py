@@ -45,7 +45,11 @@ def load_plain_yaml(text: str) -> object:
         yaml.YAMLError: the text is none.
         ValueError: a key is given twice.
     """
-    loaded: object = yaml.load(text, Loader=_PlainLoader)
+    loader = _PlainLoader(text)
+    try:
+        loaded: object = loader.get_single_data()
+    finally:
+        loader.dispose()
     return loaded
 
 
