@@ -19,7 +19,7 @@ from lanebev.estimation.two_stage.calibrator import TwoStageCalibrator
 from lanebev.testing.evaluation import WARM_UP, Track, recovery, summarise, within_3_sigma
 from lanebev.testing.moments import FPS
 from tools.known_road import KnownRoad
-from tools.random_drives import CONSTANT_BENDS, CREST, HILLS, IN_CURVE, KINDS, WINDING
+from tools.random_drives import CONSTANT_BENDS, CREST, HILLS, IN_CURVE, KINDS, TURN, WINDING
 from tools.replay.figures import as_track
 from tools.replay.recording import Recording, record, replay
 
@@ -34,6 +34,7 @@ _HILLY = ", HILLY_ROADS"
 _NOT_TWO_STAGE = (  # kinds of the joint calibrator that show nothing new of this one
     "resumed",
     WINDING,
+    TURN,
     "three lanes in view",
     "three lanes in view, unequal by 2 cm",
     *(f"{kind}, ego lane" for kind in ("motion up to 2.5°, 1.5 Hz", "drop", "knock", "cut", "resumed")),
@@ -130,7 +131,14 @@ def measure_all(count: int) -> dict[str, dict[str, Any]]:
     print("|---|---|---|---|---|---|")
     results = {}
     others = (f"{kind}{what}" for kind in KINDS if kind.startswith(IN_CURVE) for what in (_GIVEN, _TOLD))
-    for kind in (*KINDS, *others, f"{WINDING}{_GIVEN}", f"{CREST}{_HILLY}", f"{HILLS}{_HILLY}"):
+    for kind in (
+        *KINDS,
+        *others,
+        f"{WINDING}{_GIVEN}",
+        f"{TURN}{_GIVEN}",
+        f"{CREST}{_HILLY}",
+        f"{HILLS}{_HILLY}",
+    ):
         found = measure(kind.removesuffix(_TOLD).removesuffix(_HILLY), seeds, informed(kind))
         ratio = " ".join("–" if math.isnan(value) else f"{value:.2f}" for value in found.ratio)
         back = f"{min(found.back):.0f} to {max(found.back):.0f}" if found.back else ""

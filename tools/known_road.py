@@ -14,7 +14,6 @@ from lanebev.observation.segments import LaneSegments
 from lanebev.testing.moments import Moment
 from lanebev.types import Calibration
 
-_STEP = 0.01  # m along the road
 _KNOWN = 1e-9  # 1/m, standard deviation of the shape
 
 
@@ -56,19 +55,13 @@ class KnownRoad(JointCalibrator):
 
 
 def shape_of(moment: Moment, phase: Tensor) -> Tensor:
-    """Compute d²X/dZ² of the road's middle at the first knot, and its steps (B, 1 + NUM_STEPS), 1/m.
+    """Compute the curvature of the road at the first knot, and its steps (B, 1 + NUM_STEPS), 1/m.
 
     Args:
         moment: with a curvature by the distance along the road.
         phase: (B,) m, how far the first knot lies behind the camera.
     """
     assert moment.curvature is not None
-    along = torch.arange(0.0, 80.0, _STEP, dtype=phase.dtype)
-    curvature = moment.curvature(along)
-    heading = torch.nn.functional.pad(torch.cumulative_trapezoid(curvature, dx=_STEP), (1, 0))
-    ahead = torch.nn.functional.pad(torch.cumulative_trapezoid(heading.cos(), dx=_STEP), (1, 0))
     knots = KNOT_SPACING * torch.arange(1 + NUM_STEPS, dtype=phase.dtype) - phase.unsqueeze(-1)
-    nearest = torch.searchsorted(ahead, knots.clamp(min=0.0)).clamp(max=len(along) - 1)
-    at_knots = (curvature / heading.cos() ** 3)[nearest]
-    at_knots[:, 0] = moment.curvature(-phase)
+    at_knots = moment.curvature(knots)
     return torch.cat([at_knots[:, :1], at_knots.diff(dim=-1)], dim=-1)

@@ -23,11 +23,13 @@ from tools.replay.kinds import (
     drop,
     in_curve,
     knock,
+    turn,
     winding,
 )
 
 IN_CURVE = "motion up to 1.5°, 1.2 Hz, R 300 m"
 WINDING = "winding road at 3 to 12 m/s"
+TURN = "turn of R 15 to 60 m at 4 to 10 m/s"
 CREST = "crest or dip, R 5 to 20 km"
 HILLS = "crests and dips in turn"
 CROSSFALL = "crossfall changes by 2 to 6 %"
@@ -103,6 +105,18 @@ def _resumed(seed: int) -> Generated:
         return replace(moment, tag="resumed" if t == 0 else "")
 
     return replace(_drawn(seed, change), resumed=lambda: moments(1.0, before))
+
+
+def _turn(seed: int) -> Generated:
+    """Drive through a turn of R = 15 to 60 m at 4 to 10 m/s, two to four boundaries in sight."""
+    random = Random(seed)
+    radius = math.exp(random.uniform(math.log(15.0), math.log(60.0)))
+    speed = min(random.uniform(4.0, 10.0), 2 * math.sqrt(radius))  # 4 m/s² across at most
+    transition, arc = random.uniform(0.3, 0.8) * radius, random.uniform(0.3, 1.0) * radius
+    visible = random.choice(((2, 3), (1, 2, 3), (2, 3, 4), (1, 2, 3, 4)))
+    change = turn(speed, random.choice((-1, 1)) * radius, transition, arc, visible)
+    motion = sinusoids(seed, 1.0, largest_m=0.03)
+    return Generated("", lambda: moments(2 * FRAMES / FPS, change, motion))
 
 
 def _crest(seed: int) -> Generated:
@@ -235,6 +249,7 @@ def _rolled_ego_lane_of(kind: str, seed: int) -> Generated:
 KINDS: dict[str, Callable[[int], Generated]] = {
     **_ALL_LANES,
     WINDING: _winding,
+    TURN: _turn,
     CREST: _crest,
     HILLS: _hills,
     CROSSFALL: _crossfall,

@@ -7,6 +7,7 @@ from torch import Tensor
 
 from lanebev.estimation.checks import padded
 from lanebev.estimation.joint.measurement.observations import boundary_places
+from lanebev.estimation.joint.measurement.road_curve import road_points, road_shape
 from lanebev.geometry.road import image_from_road_points
 from lanebev.observation.segments import LaneSegments
 from lanebev.tensors import join_tensors
@@ -18,6 +19,7 @@ INTRINSICS = torch.tensor([[1000.0, 0.0, 640.0], [0.0, 1000.0, 360.0], [0.0, 0.0
 POSE = (0.03, -0.02, 0.015, 1.45)
 """Pitch, yaw, roll (rad) and height (m) of :func:`lanes` by default."""
 
+_NEWTON_STEPS = 6  # to the arc at which a boundary is at a given distance
 _NEAR, _FAR, _DEPTH = 7.0, 25.0, 10.0  # m: ends of :func:`lanes` lie at 7 to 17 and at 25 to 35
 
 
@@ -31,8 +33,7 @@ def project_boundaries(
 ) -> Tensor:
     """Project the end points of segments on lane boundaries into the image, without noise.
 
-    Boundary k is X(Z) = b(Z) + x_k (1 + b'(Z)² / 2) with b(Z) = c0 Z² / 2 + c1 Z³ / 6, see
-    :mod:`lanebev.estimation.joint.measurement.residuals`.
+    The boundaries are parallel to a clothoid, see :mod:`lanebev.estimation.joint.measurement.road_curve`.
 
     Args:
         params: (B, 7) pitch, yaw, roll, height, offset, c0, c1.
@@ -45,11 +46,15 @@ def project_boundaries(
     Returns:
         (B, N, 2, 2) px.
     """
-    offset, c0, c1 = (part[:, None, None] for part in params[:, 4:].unbind(-1))
-    place = boundary_places(lane_width, num_boundaries, params).gather(1, boundary).unsqueeze(-1) + offset
-    heading = c0 * z + c1 * z.square() / 2
-    x = place * (1 + heading.square() / 2) + c0 * z.square() / 2 + c1 * z**3 / 6
-    road = torch.stack([x, z], dim=-1).flatten(1, 2)
+    offset = params[:, 4:5]
+    place = (boundary_places(lane_width, num_boundaries, params).gather(1, boundary) + offset).unsqueeze(-1)
+    line, place, z = road_shape(params[:, 5:], None), place.expand_as(z).flatten(1), z.flatten(1)
+    at = road_points(z, line)
+    for _ in range(_NEWTON_STEPS):
+        missed = z - (at.z - place * at.sin)
+        at = road_points(at.arc + missed / (at.cos * (1 - at.curvature * place)), line)
+    x = at.x + place * at.cos
+    road = torch.stack([x, z], dim=-1)
     pixels, _ = image_from_road_points(road, intrinsics, Extrinsics.unstack(params[:, :4]))
     endpoints: Tensor = pixels.unflatten(1, (-1, 2))
     return endpoints

@@ -36,6 +36,7 @@ KINDS = (
     "strong motion in a curve",
     "suspension",
     "sharp bends",
+    "turn",
     "winding road",
     "speed given",
     "crest",

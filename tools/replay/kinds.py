@@ -57,6 +57,8 @@ KNOCK = _degrees(3.0, -2.0, 3.0, -0.25)  # a knocked camera: 3° and 25 cm in 0.
 REMOUNT = _degrees(3.0, -4.0, 3.0, 0.2)
 TRUCK = _degrees(-3.0, 3.0, -2.0, 0.9)  # the camera of another vehicle
 SHOCK = 1.5  # s, when a knock comes
+_BEFORE_TURN = 15.0  # m, from the first frame to the clothoid into a turn
+_LARGEST_TURN = 1.0  # rad, up to which a boundary is seen
 _CUT_AT, _MOVED_AT = 2.0, 20.0  # s
 
 
@@ -104,6 +106,39 @@ def winding(speed: float, sharpest: float, waves: Sequence[tuple[float, float, f
             return size * torch.stack(each).sum(0)
 
         return replace(moment, near=5.0, far=40.0, speed=speed, curvature=curvature)
+
+    return change
+
+
+def turn(speed: float, radius: float, transition: float, arc: float, visible: tuple[int, ...]) -> Change:
+    """Drive from a straight road through a turn into another straight road, seen from 4 to 30 m.
+
+    No boundary is seen farther than where it has turned by a radian, so that none is hidden or comes back.
+
+    Args:
+        speed: m/s.
+        radius: m, positive to the right.
+        transition: m, length of the clothoids into the turn and out of it.
+        arc: m, length of the turn between them.
+        visible: boundaries in sight.
+    """
+    widest = max(0.0, *(float(PLACES[k]) * math.copysign(1.0, radius) for k in visible)) + 1.0  # m, inside
+
+    def change(t: float, moment: Moment) -> Moment:
+        start = _BEFORE_TURN - speed * t
+
+        def curvature(z: torch.Tensor) -> torch.Tensor:
+            into, out = (((z - start - at) / transition).clamp(0, 1) for at in (0.0, transition + arc))
+            return (into - out) / radius
+
+        along = torch.arange(0.0, 60.0, 0.1, dtype=torch.float64)
+        heading = torch.cumulative_trapezoid(curvature(along), dx=0.1)
+        ahead = torch.cumulative_trapezoid(heading.cos(), dx=0.1)[heading[1:].abs() < _LARGEST_TURN]
+        turned = len(ahead) < len(heading) - 1
+        far = float(ahead[-1]) - (widest * math.sin(_LARGEST_TURN) if turned else 0.0)
+        return replace(
+            moment, near=4.0, far=min(30.0, max(7.0, far)), visible=visible, speed=speed, curvature=curvature
+        )
 
     return change
 
@@ -239,6 +274,8 @@ GENERATED: dict[str, Generated] = {
     "suspension": Generated("suspension", _drive(motion=suspension(6, 4.0))),
     # R = 60 m at 15 m/s, boundaries 1, 2, 3 in sight, 45 to 105 m.
     "sharp-bends": Generated("sharp bends", _scenario("sharp bends R 60 m, three boundaries", start=3.0)),
+    # R = 25 m at 7 m/s, boundaries 1 to 4 in sight.
+    "turn": Generated("turn", _drive(turn(7.0, 25.0, 12.0, 15.0, (1, 2, 3, 4)), sinusoids(9, 1.0), fps=20.0)),
     "winding-road": Generated("winding road", _drive(_WINDING, sinusoids(8))),
     "winding-road-speed-given": Generated("speed given", _drive(_WINDING, sinusoids(8)), speed_given=True),
     "crest": Generated("crest", _scenario("crest R 10 km, 5-40 m")),

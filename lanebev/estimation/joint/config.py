@@ -47,8 +47,8 @@ class MotionConfig:
     vertical_curvature_std: float = 1e-6
     vertical_curvature_memory: float = 10.0
     hill_memory: float = 20.0
-    curvature_walk: float = 2e-6
-    curvature_step: float = 1e-4
+    curvature_walk: float = 1.4e-6
+    curvature_step: float = 5e-5
     speed: float = 20.0
     speed_std: float = 9.0
     speed_memory: float = 30.0

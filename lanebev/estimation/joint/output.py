@@ -35,6 +35,8 @@ _NOISE_FACTOR = 1.5  # so many times the noise variance is subtracted from its s
 _LEAST_HEIGHT = 0.1  # m; smaller heights are not divided by
 _LARGEST_DEVIATION = 0.6  # m; a line that deviates by more is on no boundary
 
+_ROUNDING = 5e-8  # of the trace, by which eigenvalues of information in single precision may be too small
+
 
 def single_deviation(deviations: Tensor, cfg: JointConfig) -> Tensor:
     """Compute the variance (B,) m² of any boundary's deviation if exactly one deviates.
@@ -93,7 +95,9 @@ def learned_deviation(places: Tensor, deviations: Tensor, cfg: JointConfig) -> T
     free = torch.where(deviations.abs() < _LARGEST_DEVIATION, 0.0, 1.0)  # m²
     stds = (variances[:, None, None] + free).sqrt()  # (S, B, L)
     matrix = stds.unsqueeze(-1) * places[..., :-1] * stds.unsqueeze(-2)
-    factor = cholesky(matrix + identity(places.shape[-2], places.dtype, places.device))
+    rounding = _ROUNDING * matrix.diagonal(dim1=-2, dim2=-1).sum(-1)
+    one = identity(places.shape[-2], places.dtype, places.device)
+    factor = cholesky(matrix + (1 + rounding)[..., None, None] * one)
     white = solve_lower(factor, (stds * places[..., -1]).unsqueeze(-1))
     evidence = 0.5 * white.square().sum((-2, -1)) - factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
     weights = (evidence + constant(tuple(map(math.log, _SHARES)), like=places).unsqueeze(-1)).softmax(0)

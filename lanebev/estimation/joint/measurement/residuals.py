@@ -2,14 +2,14 @@
 
 The equations (J1) to (J33) that this package cites are in docs/method/joint.md.
 
-Boundary k lies on the road at X_k(Z) = b(Z) + x_k (1 + b'(Z)² / 2), with x_k = offset + (its position from
-the ego lane's middle): parallel curves, to second order in their heading b'. The bend b is linear in the
-shape parameters: c0 Z²/2 + c1 Z³/6 (third-order clothoid), or the double integral of a curvature that is
-linear between knots. The road is h + κ Z²/2 below the camera, κ its vertical curvature, positive over a
-crest; on a plane road the direction d = road_from_cam K⁻¹ (x, y, 1) of an end point meets it at (X, Z) = h
-(d_x, d_z) / d_y. The boundary is seen where d is parallel to (X_k, h + κ Z²/2, Z), and
+The road's middle line begins below the camera, and its curvature along the arc is given: by a clothoid, or
+linear between knots. Boundary k is parallel to it, x_k = offset + (its position from the ego lane's middle)
+to the right. An end point is beside the point of the middle line whose perpendicular it lies on. The road is
+h + κ Z²/2 below the camera, κ its vertical curvature, positive over a crest; on a plane road the direction
+d = road_from_cam K⁻¹ (x, y, 1) of an end point meets it at (X, Z) = h (d_x, d_z) / d_y. With ψ the heading of
+the middle line there, the boundary is seen where d is parallel to P = (X_k, h + κ Z²/2, Z), and
 
-    n = (h - κ Z²/2, Z X' - X, κ Z X - (h + κ Z²/2) X')
+    n = P × (sin ψ, κ Z cos ψ, cos ψ)
 
 is the normal of the plane through the camera and the boundary's tangent there. The perpendicular distance in
 pixels is that of the end point to this tangent, n·d / |∂(n·d)/∂(x, y)|: exact for straight boundaries, of
@@ -26,9 +26,10 @@ from lanebev.estimation.joint.measurement.observations import Observations, by_e
 from lanebev.estimation.joint.measurement.road_curve import (
     NUM_STEPS,
     Road,
-    RoadCurve,
-    curve_by_shape,
-    road_curve,
+    RoadPoints,
+    arc_beside,
+    lateral_by_shape,
+    road_points,
     road_shape,
 )
 from lanebev.geometry.linalg import times_vector
@@ -64,7 +65,7 @@ class Sight(NamedTuple):
         valid: (B, N) bool, both end points meet the road nearer than that.
         profile: of the road.
         road: its middle line.
-        curve: (B, M) each, the road's middle line at z.
+        beside: (B, M) each, the points of the middle line that the end points are beside.
     """
 
     rotation: Tensor
@@ -75,7 +76,19 @@ class Sight(NamedTuple):
     valid: Tensor
     profile: Profile
     road: Road
-    curve: RoadCurve
+    beside: RoadPoints
+
+
+class Feet(NamedTuple):
+    """Foot points of end points on their boundaries.
+
+    Attributes:
+        pixels: (B, 3, M) px, (x, y, 1).
+        near: points of the road's middle line beside the end points.
+    """
+
+    pixels: Tensor
+    near: RoadPoints
 
 
 class Residuals(NamedTuple):
@@ -109,16 +122,17 @@ def look(params: Tensor, seen: Observations, phase: Tensor | None = None) -> Sig
     directions = torch.bmm(road_from_image, seen.pixels)
     z, valid = meet_road(directions, profile), before_farthest(directions, profile)
     road = _road(params, phase)
-    curve = road_curve(z, road)
-    return Sight(rotation, by_roll, road_from_image, seen.pixels, z, valid, profile, road, curve)
+    first = road_points(z, road)
+    beside = road_points(arc_beside(_right(directions, z), z, first), road)
+    return Sight(rotation, by_roll, road_from_image, seen.pixels, z, valid, profile, road, beside)
 
 
 def every_segment(sight: Sight, stride: int) -> Sight:
     """Keep only every n-th segment."""
-    pixels, z, *curve = (
-        by_ends(part)[..., ::stride].flatten(-2) for part in (sight.pixels, sight.z, *sight.curve)
+    pixels, z, *beside = (
+        by_ends(part)[..., ::stride].flatten(-2) for part in (sight.pixels, sight.z, *sight.beside)
     )
-    return sight._replace(pixels=pixels, z=z, valid=sight.valid[:, ::stride], curve=RoadCurve(*curve))
+    return sight._replace(pixels=pixels, z=z, valid=sight.valid[:, ::stride], beside=RoadPoints(*beside))
 
 
 def boundary_residuals(
@@ -126,7 +140,7 @@ def boundary_residuals(
     places: Tensor,
     seen: Observations,
     phase: Tensor | None = None,
-    feet: Tensor | None = None,
+    feet: Feet | None = None,
     sight: Sight | None = None,
 ) -> Residuals:
     """Compute the perpendicular pixel distance of every end point to its boundary, with its Jacobian.
@@ -142,7 +156,7 @@ def boundary_residuals(
         places: (B, N) m, X of each segment's boundary at Z = 0 less the offset.
         seen: what was observed.
         phase: (B,) m, how far the first knot lies behind the camera, 0 to KNOT_SPACING; or None.
-        feet: (B, 3, M) foot points, by :func:`foot_points` at parameters nearby; None finds them.
+        feet: by :func:`foot_points` at parameters nearby; None finds them.
         sight: from this pose, if it is known already.
 
     Returns:
@@ -150,10 +164,10 @@ def boundary_residuals(
     """
     sight = look(params, seen, phase) if sight is None else sight
     feet = foot_points(params, places, seen, sight) if feet is None else feet
-    foot, profile = torch.bmm(sight.road_from_image, feet), sight.profile
+    foot, profile = torch.bmm(sight.road_from_image, feet.pixels), sight.profile
     z, x_k = meet_road(foot, profile), _lateral(params, places)
-    curve = road_curve(z, sight.road)
-    normal, slope = tangent_plane(z, x_k, profile, curve)
+    at = road_points(arc_beside(_right(foot, z), z, feet.near), sight.road)
+    normal = tangent_plane(x_k, profile, at)
     line = torch.bmm(sight.road_from_image.mT, normal)
     per_pixel = _per_pixel(line)
     distance = (line * sight.pixels).sum(1) * per_pixel
@@ -163,12 +177,12 @@ def boundary_residuals(
     # pitch turns about the camera's x, seen in the road's axes, yaw about the rolled y, roll about z
     axes = torch.cat([sight.rotation[:, :, :1], sight.by_roll[:, :, 1:]], dim=-1).mT
     by_angles = torch.bmm(axes, _cross(normal, foot))  # ∂(n·d)/∂angle = n · (-axis × d) = axis · (n × d)
-    up = profile.curvature * z * ahead - down  # -n_x of the foot, per metre of Z
-    by_height, by_offset = x - slope * ahead, up + 0.5 * up * curve.heading.square()
-    by_shape = curve_by_shape(z, up, up * x_k * curve.heading, sight.road)
-    by_vertical = (0.5 * z * z * by_height).unsqueeze(1)  # the road is lower by Z²/2 per unit of it
+    by_height = torch.addcmul(x * at.cos, ahead, at.sin, value=-1)
+    across = torch.addcmul(-down, profile.curvature * z, ahead).unsqueeze(1)  # per metre across the boundary
+    by_shape = across * lateral_by_shape(at, sight.road)
+    by_vertical = 0.5 * z * z * by_height  # the road is lower by Z²/2 per unit of it
     jacobian = torch.cat(
-        [by_angles, by_height.unsqueeze(1), by_offset.unsqueeze(1), *by_shape, by_vertical], dim=1
+        [by_angles, by_height.unsqueeze(1), across, by_shape, by_vertical.unsqueeze(1)], dim=1
     )
     given = jacobian[:, :-1] if phase is None else jacobian
     return Residuals(_of_valid(distance, sight.valid), given, jacobian[:, -1], z, sight.valid)
@@ -178,21 +192,22 @@ def boundary_distances(
     params: Tensor,
     places: Tensor,
     seen: Observations,
-    feet: Tensor,
+    feet: Feet,
     phase: Tensor | None,
 ) -> tuple[Tensor, Tensor]:
     """Compute the distances of :func:`boundary_residuals` alone, (B, 2, N) px, and their validity (B, N)."""
     rotation, _ = road_from_cam_and_roll(params[:, :HEIGHT])
     road_from_image, profile = torch.bmm(rotation, seen.cam_from_image), _profile(params, phase)
     valid = before_farthest(torch.bmm(road_from_image, seen.pixels), profile)
-    z = meet_road(torch.bmm(road_from_image, feet), profile)
-    curve = road_curve(z, _road(params, phase))
-    normal, _ = tangent_plane(z, _lateral(params, places), profile, curve)
+    foot, road = torch.bmm(road_from_image, feet.pixels), _road(params, phase)
+    z = meet_road(foot, profile)
+    at = road_points(arc_beside(_right(foot, z), z, feet.near), road)
+    normal = tangent_plane(_lateral(params, places), profile, at)
     line = torch.bmm(road_from_image.mT, normal)
     return _of_valid((line * seen.pixels).sum(1) * _per_pixel(line), valid), valid
 
 
-def foot_points(params: Tensor, places: Tensor, seen: Observations, sight: Sight) -> Tensor:
+def foot_points(params: Tensor, places: Tensor, seen: Observations, sight: Sight) -> Feet:
     """Find the foot point of every end point on its boundary, by one Newton step in the image.
 
     A foot point is moved by ``FOOT_RANGE`` at most: an end point farther off is an outlier.
@@ -202,18 +217,15 @@ def foot_points(params: Tensor, places: Tensor, seen: Observations, sight: Sight
         places: likewise.
         seen: likewise.
         sight: with the same parameters.
-
-    Returns:
-        (B, 3, M) px, (x, y, 1).
     """
-    normal, _ = tangent_plane(sight.z, _lateral(params, places), sight.profile, sight.curve)
+    normal = tangent_plane(_lateral(params, places), sight.profile, sight.beside)
     line = torch.bmm(sight.road_from_image.mT, normal)
     per_pixel = _per_pixel(line)
     reach = (FOOT_RANGE * seen.focal).unsqueeze(-1)
     distance = (line * sight.pixels).sum(1) * per_pixel
     step = distance.clamp(-reach, reach) * per_pixel
     points = torch.addcmul(sight.pixels[:, :2], step.unsqueeze(1), line[:, :2], value=-1)
-    return pad(points, (0, 0, 0, 1), value=1.0)
+    return Feet(pad(points, (0, 0, 0, 1), value=1.0), sight.beside)
 
 
 def normal_equations(jacobian: Tensor, distance: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
@@ -241,7 +253,7 @@ def sampson_distances(params: Tensor, places: Tensor, sight: Sight) -> Tensor:
     Returns:
         (H, B, 2, N) px, zero where not valid.
     """
-    normal, _ = tangent_plane(sight.z, _lateral(params, places), sight.profile, sight.curve)
+    normal = tangent_plane(_lateral(params, places), sight.profile, sight.beside)
     line = sight.road_from_image.mT @ normal
     return _of_valid((line * sight.pixels).sum(-2) * _per_pixel(line), sight.valid)
 
@@ -278,21 +290,24 @@ def _profile(params: Tensor, phase: Tensor | None) -> Profile:
     return road_profile(height, torch.zeros_like(height) if phase is None else params[:, VERTICAL:])
 
 
-def tangent_plane(z: Tensor, x_k: Tensor, profile: Profile, curve: RoadCurve) -> tuple[Tensor, Tensor]:
-    """Compute the normal n (…, B, 3, M) of the plane through camera and tangent of a boundary, and X'(Z).
+def tangent_plane(x_k: Tensor, profile: Profile, beside: RoadPoints) -> Tensor:
+    """Compute the normal n (…, B, 3, M) of the plane through camera and tangent of a boundary.
 
     Source: (J2) and (J4).
 
     Args:
-        z: (B, M) m.
-        x_k: (…, B, M) m.
+        x_k: (…, B, M) m, lateral position of the boundary.
         profile: of the road.
-        curve: at z.
+        beside: points of the middle line beside it.
     """
-    tilt = x_k * curve.heading
-    slope = torch.addcmul(curve.heading, tilt, curve.curvature)
-    out = torch.addcmul(x_k + curve.bend, tilt, curve.heading, value=0.5)
+    sin, cos = beside.sin, beside.cos
+    x, z = torch.addcmul(beside.x, x_k, cos), torch.addcmul(beside.z, x_k, sin, value=-1)
     climb = profile.curvature * z  # slope of the road, positive downwards
     across, deep = (torch.addcmul(profile.height, climb, z, value=half) for half in (-0.5, 0.5))
-    along = torch.addcmul(climb * out, deep, slope, value=-1)
-    return torch.stack([across.expand_as(out), z * slope - out, along], dim=-2), slope
+    along = torch.addcmul(climb * x * cos, deep, sin, value=-1)
+    return torch.stack([across * cos, torch.addcmul(z * sin, x, cos, value=-1), along], dim=-2)
+
+
+def _right(directions: Tensor, z: Tensor) -> Tensor:
+    """Compute X (B, M) m of the points at distances z (B, M) m in directions (B, 3, M)."""
+    return z * directions[:, 0] / directions[:, 2].clamp(min=1e-3)

@@ -1,4 +1,4 @@
-"""The middle line of the road: bend, heading and curvature at a distance, as a clothoid or as a spline."""
+"""The middle line of the road: its points and headings along the arc, of a curvature that is given."""
 
 from typing import NamedTuple
 
@@ -6,120 +6,206 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from lanebev.tensors import constant
+from lanebev.tensors import constant, made_once
 
-KNOT_SPACING = 10.0  # m
-NUM_STEPS = 5
+KNOT_SPACING = 5.0  # m
+NUM_STEPS = 10
 """Steps of curvature between knots, where the shape is a spline: c at the first knot and these, 1/m."""
 
-_SQUARE, _CUBE = KNOT_SPACING / 2, KNOT_SPACING**2 / 6  # heading and bend of a unit ramp, one spacing on
-_KNOTS = tuple(map(float, range(1 + NUM_STEPS)))  # knot spacings, from the first
-_BEGIN_AND_END = tuple(
-    tuple(float(k == j) - (k == j + 1) for k in range(1 + NUM_STEPS)) for j in range(NUM_STEPS)
-)
-_POWERS = ((3.0,), (2.0,), (1.0,), (0.0,))  # powers of the distance past a knot, for each coefficient
-_BY_RAMP = tuple(  # the coefficients by a ramp from each knot on; the first is not ahead, see road_shape
-    (factor * first, *[factor] * NUM_STEPS)
-    for factor, first in ((_CUBE, 0.0), (_SQUARE, 0.0), (1.0, 1.0), (1 / KNOT_SPACING, 1.0))
-)
-_BY_CURVATURE = ((0.0,), (0.0,), (1.0,), (0.0,))
+_SPACING = 2.5  # m between nodes
+_NODES = 85  # up to 210 m
+_LARGEST_HEADING = 1.2  # rad; from there on the middle line is taken as straight
+_LEAST_RATIO = 0.3  # of the distance from the centre of curvature to the radius, in a step along the arc
+_HALF = KNOT_SPACING / 2  # heading of a unit step, one spacing past its knot
 
 
 class Road(NamedTuple):
-    """The middle line of the road, a polynomial of the third degree between knots.
+    """The middle line of the road, which begins at the camera in the direction of Z.
 
     Attributes:
-        pieces: (B, 4, K), the coefficients a (m), b, c (1/m) and m (1/m²) from each knot on: the bend is
-            a + b Z + c Z²/2 + m Z³/6. A clothoid is one piece, a = b = 0, c and m the curvature and its rate.
-        past: (B, 1 + NUM_STEPS, 1), how far the camera is past each knot, in knot spacings; a clothoid: None.
+        nodes: (B, 5, G), at points ``_SPACING`` apart along the arc: heading (rad, positive to the right), X,
+            Z (m), curvature (1/m) and its rate up to the next (1/m²).
+        origin: (B, 1) m, arc from the first node to the camera.
+        spline: whether the shape is a spline, else a clothoid.
     """
 
-    pieces: Tensor
-    past: Tensor | None
+    nodes: Tensor
+    origin: Tensor
+    spline: bool
 
 
-class RoadCurve(NamedTuple):
-    """The road's middle line at some distances.
+class RoadPoints(NamedTuple):
+    """Points of the road's middle line.
 
     Attributes:
-        bend: (B, M) m, b(Z).
-        heading: (B, M), b'(Z).
-        curvature: (B, M) 1/m, b''(Z).
+        arc: (B, M) m, from the camera.
+        x: (B, M) m, right of the camera.
+        z: (B, M) m, ahead.
+        sin: (B, M), of the heading.
+        cos: (B, M), likewise.
+        curvature: (B, M) 1/m.
+        turned: (B, M) rad, change of the heading since the node before.
     """
 
-    bend: Tensor
-    heading: Tensor
+    arc: Tensor
+    x: Tensor
+    z: Tensor
+    sin: Tensor
+    cos: Tensor
     curvature: Tensor
+    turned: Tensor
 
 
 def road_shape(shape: Tensor, phase: Tensor | None) -> Road:
-    """Compute the coefficients of the road's middle line.
+    """Compute the middle line of a shape.
 
-    Source: (J3), in which the knots that are passed count. Bend and heading are 0 at the camera, so the first
-    knot, which is not ahead, changes only the curvature and its rate.
+    Source: (J3). The curvature is linear between nodes, so the heading is exact; X and Z are summed over the
+    intervals between nodes, each a chord in the direction of its mean heading.
 
     Args:
-        shape: (B, 2), c0 and c1 of a clothoid; with a phase (B, 1 + NUM_STEPS), curvature at the first knot
-            and its steps from knot to knot.
+        shape: (B, 2), c0 (1/m) and c1 (1/m²) of a clothoid; with a phase (B, 1 + NUM_STEPS), curvature at
+            the first knot and its steps from knot to knot.
         phase: (B,) m, how far the first knot lies behind the camera, or None.
     """
-    if phase is None:
-        return Road(pad(shape, (2, 0)).unsqueeze(-1), None)
-    past = phase.unsqueeze(-1) / KNOT_SPACING - constant(_KNOTS, like=phase)  # (B, K)
-    changes = shape[:, 1:] @ constant(_BEGIN_AND_END, like=shape)  # (B, K), of the slope at every knot
-    ramps = past.unsqueeze(1).pow(constant(_POWERS, like=past)) * constant(_BY_RAMP, like=past)
-    first = shape[:, :1, None] * constant(_BY_CURVATURE, like=shape)
-    pieces = torch.add((ramps * changes.unsqueeze(1)).cumsum(-1), first)
-    return Road(pieces, past.unsqueeze(-1))
+    spline = phase is not None
+    origin = torch.zeros_like(shape[:, :1]) if phase is None else phase.unsqueeze(-1)
+    tables = _by_unit_shape(spline, shape.dtype, shape.device)
+    before = shape.unsqueeze(1) @ _heading_by_shape(origin, torch.zeros_like(origin), spline)  # (B, 1, 1)
+    headings, bent = (
+        (shape @ tables).movedim(0, 1).split(2, dim=1)
+    )  # (B, 2, G): at the nodes, and the means between
+    headings = headings - before
+    straight = headings[:, :1].abs() > _LARGEST_HEADING
+    headings = headings.clamp(-_LARGEST_HEADING, _LARGEST_HEADING)
+    mean, turned = headings[:, 1:, :-1], headings[:, :1].diff(dim=-1)
+    chords = _SPACING * _chord(turned) * torch.cat([mean.sin(), mean.cos()], dim=1)
+    places = pad(chords.cumsum(-1), (1, 0))
+    nodes = torch.cat([headings[:, :1], places, bent.masked_fill(straight, 0.0)], dim=1)
+    road = Road(nodes, origin, spline)
+    camera = road_points(torch.zeros_like(origin), road)
+    moved = torch.stack([camera.x, camera.z], dim=1)  # (B, 2, 1)
+    return road._replace(nodes=nodes - pad(moved, (0, 0, 1, 2)))
 
 
-def road_curve(z: Tensor, road: Road) -> RoadCurve:
-    """Compute bend, heading and curvature of the road's middle line at z (B, M) m, bend and heading 0 at 0.
-
-    Source: (J3).
-    """
-    a, b, c, m = _pieces_at(z, road).unbind(1)
-    ramp = m * z
-    return RoadCurve(
-        bend=torch.addcmul(a, z, torch.addcmul(b, z, torch.add(c, ramp, alpha=1 / 3), value=0.5)),
-        heading=torch.addcmul(b, z, torch.add(c, ramp, alpha=0.5)),
-        curvature=c + ramp,
+def road_points(arc: Tensor, road: Road) -> RoadPoints:
+    """Compute the points of the middle line at arcs (B, M) m from the camera."""
+    cell, way = _cells(arc, road)
+    heading, x, z, curvature, rate = road.nodes.gather(2, cell.unsqueeze(1).expand(-1, 5, -1)).unbind(1)
+    turned = way * torch.addcmul(curvature, rate, way, value=0.5)
+    mean = torch.addcmul(heading, way, torch.addcmul(curvature, rate, way, value=1 / 3), value=0.5)
+    heading, chord = heading + turned, way * _chord(turned)
+    return RoadPoints(
+        arc=arc,
+        x=torch.addcmul(x, chord, mean.sin()),
+        z=torch.addcmul(z, chord, mean.cos()),
+        sin=heading.sin(),
+        cos=heading.cos(),
+        curvature=torch.addcmul(curvature, rate, way),
+        turned=turned,
     )
 
 
-def _pieces_at(z: Tensor, road: Road) -> Tensor:
-    """Return the coefficients (B, 4, M) of the road's piece in which z (B, M) m lies; (B, 4, 1): clothoid."""
-    if road.past is None:
-        return road.pieces
-    passed = torch.add(road.past[:, 0], z, alpha=1 / KNOT_SPACING).long().clamp(0, NUM_STEPS)
-    return road.pieces.gather(2, passed.unsqueeze(1).expand(-1, 4, -1))
+def arc_beside(x: Tensor, z: Tensor, near: RoadPoints) -> Tensor:
+    """Compute the arc (B, M) m at which points are beside the middle line, by a Newton step.
 
-
-def curve_by_shape(z: Tensor, by_bend: Tensor, by_heading: Tensor, road: Road) -> tuple[Tensor, ...]:
-    """Compute the derivative of a function of bend and heading by the shape parameters.
+    Source: the line from a point of the road to the nearest one of its middle line is perpendicular to it.
 
     Args:
-        z: (B, M) m.
-        by_bend: (B, M), its derivative by the bend.
-        by_heading: (B, M), likewise.
-        road: whose knots count.
+        x: (B, M) m, of points of the road.
+        z: (B, M) m, likewise.
+        near: points of the middle line, from which the step starts.
+    """
+    right, ahead = x - near.x, z - near.z
+    lateral = torch.addcmul(right * near.cos, ahead, near.sin, value=-1)
+    along = torch.addcmul(right * near.sin, ahead, near.cos)
+    arc = near.arc + along / (1 - near.curvature * lateral).clamp(min=_LEAST_RATIO)
+    return arc.clamp(-KNOT_SPACING, _SPACING * (_NODES - 1))
+
+
+def lateral_by_shape(at: RoadPoints, road: Road) -> Tensor:
+    """Compute the derivative of the lateral position of the middle line by the parameters of its shape.
+
+    Source: with ψ the heading and ψ_j its derivative by parameter j, the point at the arc s moves across the
+    line by ∫₀ˢ cos(ψ(s) - ψ(u)) ψ_j(u) du, here the sum over the intervals of :func:`road_shape`.
 
     Returns:
-        the rows (B, ..., M) of the K parameters in order, one or several a tensor.
+        (B, K, M) m.
     """
-    first = z * torch.addcmul(by_heading, by_bend, z, value=0.5)
-    if road.past is None:
-        return first.unsqueeze(1), (0.5 * z * z * (by_bend * z / 3 + by_heading)).unsqueeze(1)
-    past = torch.add(road.past, z.unsqueeze(1), alpha=1 / KNOT_SPACING).clamp_(min=0.0)
-    of_square, of_cube = (_SQUARE * by_heading).unsqueeze(1), (_CUBE * by_bend).unsqueeze(1)
-    ramps = torch.addcmul(of_square, of_cube, past).mul_(past * past)
-    steps = ramps[:, :-1] - ramps[:, 1:]  # a step rises from 0 at its knot to 1 at the next
-    heading, bend = _behind(road.past[:, 0])
-    head = steps[:, 0] - torch.addcmul(by_bend * bend, heading, torch.addcmul(by_heading, by_bend, z))
-    return first.unsqueeze(1), head.unsqueeze(1), steps[:, 1:]
+    zero = torch.zeros_like(road.origin)
+    before = _heading_by_shape(road.origin, zero, road.spline)  # (B, K, 1)
+    heading, mean, _, _ = _by_unit_shape(road.spline, at.arc.dtype, at.arc.device)
+    turned, longer = (mean - before)[..., :-1], heading.diff(dim=-1)  # (…, K, G - 1), of the intervals
+    turn, right, ahead = road.nodes[:, :3].diff(dim=-1).unsqueeze(2).unbind(1)  # (B, 1, G - 1)
+    longer = -turn / 12 * longer  # of a chord
+    sums = torch.cat([ahead * turned + right * longer, ahead * longer - right * turned], dim=1).cumsum(-1)
+    sums = pad(sums, (1, 0))  # (B, 2 K, G)
+    nodes = torch.cat([road.nodes[:, 1:3], sums], dim=1)
+
+    def moved(points: RoadPoints) -> tuple[Tensor, ...]:
+        cell, way = _cells(points.arc, road)
+        sizes = [1, 1, before.shape[1], before.shape[1]]
+        of_nodes = nodes.gather(2, cell.unsqueeze(1).expand(-1, sum(sizes), -1))
+        x, z, across, along = of_nodes.split_with_sizes(sizes, dim=1)
+        # a chord is shorter the more it turns; that moves its end across as a mean heading farther on does
+        back = way * (0.5 - points.turned.square() / 24)
+        turn = _heading_by_shape(points.arc + road.origin - back, way, road.spline) - before
+        return across, along, turn, points.x.unsqueeze(1) - x, points.z.unsqueeze(1) - z
+
+    across, along, turn, right, ahead = moved(road_points(zero, road))
+    first, second = torch.addcmul(across, ahead, turn), torch.addcmul(along, right, turn, value=-1)
+    across, along, turn, right, ahead = moved(at)
+    sin, cos = at.sin.unsqueeze(1), at.cos.unsqueeze(1)
+    by_nodes = torch.addcmul(cos * (across - first), sin, along - second, value=-1)
+    return torch.addcmul(by_nodes, torch.addcmul(cos * ahead, sin, right), turn)
 
 
-def _behind(past: Tensor) -> tuple[Tensor, Tensor]:
-    """Compute heading and bend (B, 1) at the camera for a unit first step, ``past`` spacings behind."""
-    square = past * past
-    return _SQUARE * square, _CUBE * (square * past)
+def _chord(turned: Tensor) -> Tensor:
+    """Compute the ratio of chord to arc, to second order in the angle by which it turns, rad."""
+    return torch.addcmul(torch.ones_like(turned), turned, turned, value=-1 / 24)
+
+
+def _cells(arc: Tensor, road: Road) -> tuple[Tensor, Tensor]:
+    """Return the node (B, M) before each arc (B, M) m, and the way (B, M) m from it."""
+    u = arc + road.origin
+    cell = (u / _SPACING).long().clamp(0, _NODES - 1)
+    return cell, torch.add(u, cell, alpha=-_SPACING)
+
+
+def _heading_by_shape(u: Tensor, width: Tensor, spline: bool) -> Tensor:
+    """Compute the derivative of the mean heading of an interval by the shape.
+
+    Args:
+        u: (B, M) m, middle of the interval, from the first node; no knot is within an interval.
+        width: (B, M) m, of the interval; 0 gives the heading at u.
+        spline: see :class:`Road`.
+
+    Returns:
+        (B, K, M) m.
+    """
+    u, square = u.unsqueeze(1), (width * width / 12).unsqueeze(1)  # the mean of u² is u² + width² / 12
+    if not spline:
+        return torch.cat([u, 0.5 * torch.addcmul(square, u, u)], dim=1)
+    knots = constant(tuple(map(float, range(1 + NUM_STEPS))), like=u)
+    past = torch.add(-knots.unsqueeze(-1), u, alpha=1 / KNOT_SPACING).clamp(min=0.0)
+    ramps = torch.addcmul(past * past, past.sign(), square, value=KNOT_SPACING**-2)
+    return torch.cat([u, _HALF * (ramps[:, :-1] - ramps[:, 1:])], dim=1)
+
+
+@made_once
+def _by_unit_shape(spline: bool, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Return the derivatives by the shape at the nodes, (4, K, G).
+
+    They are those of the heading at the node, of its mean up to the next one, of the curvature, and its rate.
+    """
+    nodes = _SPACING * torch.arange(_NODES, dtype=dtype, device=device).unsqueeze(0)
+    width = torch.full_like(nodes, _SPACING)
+    heading = _heading_by_shape(nodes, torch.zeros_like(nodes), spline)[0]
+    mean = _heading_by_shape(nodes + 0.5 * _SPACING, width, spline)[0]
+    if spline:
+        knots = KNOT_SPACING * torch.arange(NUM_STEPS, dtype=dtype, device=device).unsqueeze(-1)
+        others = ((nodes - knots) / KNOT_SPACING).clamp(0.0, 1.0)
+    else:
+        others = nodes
+    curvature = torch.cat([torch.ones_like(nodes), others])
+    rate = curvature.diff(dim=-1) / _SPACING
+    return torch.stack([heading, mean, curvature, torch.cat([rate, rate[:, -1:]], dim=-1)])

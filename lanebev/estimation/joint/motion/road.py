@@ -1,8 +1,8 @@
 """Dynamics of the shape of the road in the joint filter.
 
 The knots of the road's curvature are fixed to the road, and the camera passes them at a speed that is
-estimated too: the curvature seen far ahead becomes the curvature near by. Process noise enters only at the
-farthest step, as it comes into view. The road frame turns with the road.
+estimated too: the curvature seen far ahead becomes the curvature near by. Process noise enters at the
+farthest step, as it comes into view, and in sharp bends at every knot.
 """
 
 import math
@@ -21,13 +21,14 @@ from lanebev.tensors import constant
 
 ENTRY = KNOT_SPACING / 3  # m; a step comes into view while the camera drives so far
 _BENT = 3.0  # the road bends at the farthest knot if its curvature there is so many sigmas
-_BEND_STEP = 0.07  # standard deviation of the next step in a bend, as a fraction of that curvature
+_BEND_STEP = 0.12  # standard deviation of the next step in a bend, as a fraction of that curvature
+_WALK = 75.0  # √m³, random walk of a knot per curvature to the third power: R = 25 m by an eighth in a metre
+_NOISE = 5.0  # χ² of the steps' estimates on a straight road; larger in fewer than one frame of ten
 _SLOPE = 0.5 * (np.eye(1 + NUM_STEPS) + np.eye(1 + NUM_STEPS, k=1))  # at a knot: the mean of its steps
 _SLOPE[0] = np.eye(1 + NUM_STEPS)[1]
 _CHANGE = np.diff(_SLOPE, axis=0, prepend=0.0) / KNOT_SPACING  # 1/m, of the shape per metre driven
 _CHANGE_BY_SHAPE = tuple(map(tuple, _CHANGE.T.tolist()))
 _ORDER = range(1 + NUM_STEPS)
-_KNOTS = tuple(KNOT_SPACING * knot for knot in _ORDER)  # m, from the first
 _BEHIND = tuple(KNOT_SPACING * (NUM_STEPS - 1 - step) for step in range(NUM_STEPS))  # m
 _PASSED = (  # row 0 sums the steps up to the last knot passed, the others move by the knots passed
     tuple(tuple(k - i if i == 0 or k > 0 else math.inf for k in _ORDER) for i in _ORDER),
@@ -56,7 +57,7 @@ def propagate_road_shape(
     way = dt * (cfg.speed + mean[:, indices.speed]).clamp(min=0.0)
     gone = phase + way
     passed = (gone / KNOT_SPACING).floor()  # (B,) knots
-    shape = turn_along(mean[:, SHAPE], phase, way)
+    shape = mean[:, SHAPE]
     moved = _renumbering(passed)
     change = shape @ constant(_CHANGE_BY_SHAPE, like=shape)  # 1/m, per metre driven
     both = torch.bmm(moved, torch.stack([shape, dt.unsqueeze(-1) * change], dim=-1))  # (B, NUM_SHAPE, 2)
@@ -67,7 +68,7 @@ def propagate_road_shape(
         phase=gone - passed * KNOT_SPACING,
         transition=moved,
         by_speed=both[..., 1],
-        noise=pad(seen, (1, 0)),
+        noise=torch.addcmul(pad(seen, (1, 0)), way.unsqueeze(-1), sharp_bend_walk(shape)),
     )
 
 
@@ -88,6 +89,19 @@ def step_variance(shape: Tensor, shape_cov: Tensor, cfg: MotionConfig) -> Tensor
     return total
 
 
+def sharp_bend_walk(shape: Tensor) -> Tensor:
+    """Compute the variance (B, NUM_SHAPE) 1/m² by which the curvature at each knot walks in a metre driven.
+
+    Source: (J12). In a sharp bend the curvature differs more from the spline, between knots and beyond the
+    farthest vertices. If such errors were not expected, the speed would be estimated from them.
+
+    Args:
+        shape: (B, NUM_SHAPE).
+    """
+    variance: Tensor = (_WALK * shape.cumsum(-1) ** 3).square()
+    return variance
+
+
 def _renumbering(passed: Tensor) -> Tensor:
     """Return the transition (B, NUM_SHAPE, NUM_SHAPE) by which step j becomes step j - passed.
 
@@ -99,37 +113,12 @@ def _renumbering(passed: Tensor) -> Tensor:
     return transition
 
 
-def turn_along(shape: Tensor, phase: Tensor, way: Tensor) -> Tensor:
-    """Compute the shape parameters after the road frame turned with the road over a way.
-
-    The shape at a knot is b'' = d²X/dZ² = κ / cos³ of the road's heading there, κ its curvature. The heading
-    decreases by κ₀ per metre driven until the knot is reached. On an arc this cancels, to leading order, the
-    change because the knots approach. Two effects are left out because they improved nothing: a turn also
-    brings knots nearer, by κ₀ b; and an arc determines the speed less well than a clothoid does.
-
-    Args:
-        shape: (B, 1 + NUM_STEPS).
-        phase: (B,) m, how far the first knot lies behind the camera.
-        way: (B,) m.
-    """
-    bend = shape.cumsum(-1)  # b'' at the knots
-    behind = phase.unsqueeze(-1)
-    here = bend[:, :1] + behind / KNOT_SPACING * shape[:, 1:2]
-    to_knots = (0.5 * KNOT_SPACING * (bend[:, 1:] + bend[:, :-1])).cumsum(-1)
-    to_here = 0.5 * behind * (bend[:, :1] + here)
-    heading = (pad(to_knots, (1, 0)) - to_here).atan()
-    places = constant(_KNOTS, like=shape)
-    after = heading - here * torch.minimum(way.unsqueeze(-1), (places - behind).clamp(min=0.0))
-    bend = bend * (heading.cos() / after.cos().clamp(min=0.6)) ** 3
-    return torch.cat([bend[:, :1], bend.diff(dim=-1)], dim=-1)
-
-
 def speed_share(shape: Tensor, cov: Tensor) -> Tensor:
     """Compute the share (B,) by which the shape of the road tells the speed.
 
     Source: (J12). On a straight road the steps are estimation noise, which does not move with the road. Were
     the speed estimated from it, the vehicle would seem to stand still. So the gain of the speed is multiplied
-    by the share of the steps' χ² that exceeds its mean for noise (Wiener filter); for the rest its
+    by the share of the steps' χ² that exceeds that of noise (Wiener filter); for the rest its
     uncertainty is considered, but it is not estimated (Schmidt 1966).
 
     Args:
@@ -140,8 +129,8 @@ def speed_share(shape: Tensor, cov: Tensor) -> Tensor:
     size = spread.diagonal(dim1=1, dim2=2).rsqrt()  # (B, NUM_STEPS)
     factor = cholesky(size.unsqueeze(-1) * spread * size.unsqueeze(-2))
     white = solve_lower(factor, (size * steps).unsqueeze(-1))
-    chi2 = white.square().sum((1, 2))  # its mean for noise is NUM_STEPS
-    share: Tensor = 1 - NUM_STEPS / chi2.clamp(min=NUM_STEPS)
+    chi2 = white.square().sum((1, 2))
+    share: Tensor = 1 - _NOISE / chi2.clamp(min=_NOISE)
     return share
 
 
