@@ -51,7 +51,7 @@ class SmoothedPoses(NamedTuple):
 class StoredStates(Sequence[JointState]):
     """States of batch size 1 after every frame, stored in a file so that memory stays constant.
 
-    A state of six boundaries takes 6 kB, so that an hour at 30 frames a second takes 0.7 GB.
+    A state of six boundaries takes 10 kB, so that an hour at 30 frames a second takes 1.1 GB.
 
     Args:
         like: a state of the same shapes and dtypes.

@@ -95,8 +95,9 @@ def learned_deviation(places: Tensor, deviations: Tensor, cfg: JointConfig) -> T
     free = torch.where(deviations.abs() < _LARGEST_DEVIATION, 0.0, 1.0)  # m²
     stds = (variances[:, None, None] + free).sqrt()  # (S, B, L)
     matrix = stds.unsqueeze(-1) * places[..., :-1] * stds.unsqueeze(-2)
-    rounding = _ROUNDING * matrix.diagonal(dim1=-2, dim2=-1).sum(-1)
     one = identity(places.shape[-2], places.dtype, places.device)
+    spoiled = ~(cholesky(matrix + one).diagonal(dim1=-2, dim2=-1) > 0).all(-1)
+    rounding = _ROUNDING * matrix.diagonal(dim1=-2, dim2=-1).sum(-1) * spoiled
     factor = cholesky(matrix + (1 + rounding)[..., None, None] * one)
     white = solve_lower(factor, (stds * places[..., -1]).unsqueeze(-1))
     evidence = 0.5 * white.square().sum((-2, -1)) - factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)

@@ -186,7 +186,7 @@ def test_a_stream_has_no_second_pass(data, tmp_path, capsys):
     assert "expected no --smooth with a stream, got it; leave it out" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(("num", "kilobytes"), [(6, 8.13), (4, 6.74)])
+@pytest.mark.parametrize(("num", "kilobytes"), [(6, 10.2), (4, 8.53)])
 def test_kept_states_come_back_to_the_bit(num, kilobytes, tmp_path):
     """With four boundaries the sensitivity (1, 4, 4) is a square too, but not symmetric."""
     calibrator = JointCalibrator(num_boundaries=num)
