@@ -71,10 +71,8 @@ def road_shape(shape: Tensor, phase: Tensor | None) -> Road:
     origin = torch.zeros_like(shape[:, :1]) if phase is None else phase.unsqueeze(-1)
     tables = _by_unit_shape(spline, shape.dtype, shape.device)
     before = shape.unsqueeze(1) @ _heading_by_shape(origin, torch.zeros_like(origin), spline)  # (B, 1, 1)
-    headings, bent = (
-        (shape @ tables).movedim(0, 1).split(2, dim=1)
-    )  # (B, 2, G): at the nodes, and the means between
-    headings = headings - before
+    headings, bent = (shape @ tables).movedim(0, 1).split(2, dim=1)  # (B, 2, G) each
+    headings = headings - before  # at the nodes, and the means between them
     straight = headings[:, :1].abs() > _LARGEST_HEADING
     headings = headings.clamp(-_LARGEST_HEADING, _LARGEST_HEADING)
     mean, turned = headings[:, 1:, :-1], headings[:, :1].diff(dim=-1)
