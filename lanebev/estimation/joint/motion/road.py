@@ -23,7 +23,7 @@ ENTRY = KNOT_SPACING / 3  # m; a step comes into view while the camera drives so
 _BENT = 3.0  # the road bends at the farthest knot if its curvature there is so many sigmas
 _BEND_STEP = 0.12  # standard deviation of the next step in a bend, as a fraction of that curvature
 _WALK = 75.0  # √m³, random walk of a knot per curvature to the third power: R = 25 m by an eighth in a metre
-_NOISE = 5.0  # χ² of the steps' estimates on a straight road; larger in fewer than one frame of ten
+_NOISE = 5.0  # χ² of the steps' estimates, which is seldom exceeded on a straight road
 _SLOPE = 0.5 * (np.eye(1 + NUM_STEPS) + np.eye(1 + NUM_STEPS, k=1))  # at a knot: the mean of its steps
 _SLOPE[0] = np.eye(1 + NUM_STEPS)[1]
 _CHANGE = np.diff(_SLOPE, axis=0, prepend=0.0) / KNOT_SPACING  # 1/m, of the shape per metre driven
