@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 
+from lanebev.estimation.joint.calibrator import JointCalibrator
 from lanebev.estimation.joint.config import MotionConfig
 from lanebev.estimation.joint.filter.update import estimated_entries
 from lanebev.estimation.joint.layout import SHAPE, STEPS
@@ -18,7 +19,11 @@ from lanebev.estimation.joint.measurement.road_curve import (
     road_shape,
 )
 from lanebev.estimation.joint.motion.road import propagate_road_shape, sharp_bend_walk, speed_share
+from lanebev.tensors import map_tensors
+from lanebev.testing.moments import CAMERA, WIDTH
 from tests.estimation.joint_drives import DOUBLE, PLACE
+from tools.bench_kinds import drawn
+from tools.random_drives import TURN
 
 torch.set_num_threads(1)
 
@@ -109,11 +114,24 @@ def test_beyond_the_largest_heading_the_middle_line_is_straight():
 
 
 def test_only_in_a_sharp_bend_the_curvature_of_the_knots_walks():
-    shape = torch.zeros(2, NUM_SHAPE, dtype=DOUBLE)
-    shape[:, 0] = torch.tensor([1 / 25, 1 / 300])
+    shape = torch.zeros(4, NUM_SHAPE, dtype=DOUBLE)
+    shape[:, 0] = torch.tensor([1 / 25, 1 / 300, 1 / 15, -100.0])
     std = sharp_bend_walk(shape).sqrt()
     torch.testing.assert_close(std[0], torch.full_like(std[0], 0.12 / 25))
     assert (std[1] < 3e-6).all()
+    torch.testing.assert_close(std[3], std[2])
+
+
+def test_the_road_beyond_what_is_seen_of_a_sharp_turn_stays_possible():
+    """The far knots of a turn are beyond the heading up to which the line bends, so nothing shows them."""
+    [drive] = drawn(TURN, [20_011])
+    calibrator, sharpest = JointCalibrator(), 0.0
+    state = calibrator.initial_state(1, dtype=DOUBLE)
+    for frame in range(len(drive.dt)):
+        seen = map_tensors(lambda part, at=frame: part[at : at + 1], drive.segments)
+        _, state = calibrator(seen, CAMERA[None].double(), state, drive.dt[frame : frame + 1], WIDTH)
+        sharpest = max(sharpest, float(state.mean[:, SHAPE].cumsum(-1).abs().max()))
+    assert 0.05 < sharpest < 0.2  # 1/m
 
 
 def test_steps_like_noise_tell_no_speed():

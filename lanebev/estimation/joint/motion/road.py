@@ -23,6 +23,7 @@ ENTRY = KNOT_SPACING / 3  # m; a step comes into view while the camera drives so
 _BENT = 3.0  # the road bends at the farthest knot if its curvature there is so many sigmas
 _BEND_STEP = 0.12  # standard deviation of the next step in a bend, as a fraction of that curvature
 _WALK = 75.0  # √m³, random walk of a knot per curvature to the third power: R = 25 m by an eighth in a metre
+_SHARPEST = 1 / 15  # 1/m, curvature from which the walk grows no more
 _NOISE = 5.0  # χ² of the steps' estimates, which is seldom exceeded on a straight road
 _SLOPE = 0.5 * (np.eye(1 + NUM_STEPS) + np.eye(1 + NUM_STEPS, k=1))  # at a knot: the mean of its steps
 _SLOPE[0] = np.eye(1 + NUM_STEPS)[1]
@@ -93,12 +94,14 @@ def sharp_bend_walk(shape: Tensor) -> Tensor:
     """Compute the variance (B, NUM_SHAPE) 1/m² by which the curvature at each knot walks in a metre driven.
 
     Source: (J12). In a sharp bend the curvature differs more from the spline, between knots and beyond the
-    farthest vertices. If such errors were not expected, the speed would be estimated from them.
+    farthest vertices. If such errors were not expected, the speed would be estimated from them. The walk of a
+    knot that no vertex shows is limited, else its curvature and its variance would increase each other.
 
     Args:
         shape: (B, NUM_SHAPE).
     """
-    variance: Tensor = (_WALK * shape.cumsum(-1) ** 3).square()
+    curvature = shape.cumsum(-1).clamp(-_SHARPEST, _SHARPEST)
+    variance: Tensor = (_WALK * curvature**3).square()
     return variance
 
 
