@@ -86,25 +86,19 @@ def run(
         ValueError: bad input; one line says which and what would be right.
     """
     check_installed(config.formats)
-    config, source = open_for_run(config)
+    config, source, camera = open_inputs(config)
     files = files_of(source)
-    check_inputs_stay(config.out, input_files(config, source))
-    check_new_or_of_run(config.out)
-    camera = camera_of(config, source)
-    source = match_image_size(camera, source)
-    logger.info("%s: %d frames of %d x %d", source.source, source.count, *reversed(camera.image_size))
-    tracker, problem = resumed_tracker(config, camera)
+    tracker, refusal = resumed_tracker(config, camera)
     observer = make_observer(config, source, camera, network, tracker)
     viewer = None if config.rerun is None else open_viewer(config.rerun, camera)
+    progress = no_progress if source.is_live else progress
     with OutputFolder(config.out) as out, torch.inference_mode():
-        if config.resume and problem:
-            problem += backup_state(config.resume, out)
-        progress = no_progress if source.is_live else progress
-        reusing = (
-            observer_of_parts(parts, observer)
-            if parts
-            else recover_run(out, config, source, camera, observer)
-        )
+        if config.resume and refusal:
+            refusal += backup_state(config.resume, out)
+        if parts:
+            reusing = observer_of_parts(parts, observer)
+        else:
+            reusing = recover_run(out, config, source, camera, observer)
         last_observer, smoothed = reusing, None
         if config.smooth:
             smoothed = first_pass(config, source, tracker, reusing, out, progress)
@@ -112,22 +106,18 @@ def run(
             tracker, _ = resumed_tracker(config, camera)
             last_observer = observer_of_second_pass(out, observer, reusing, source)
         recorder = _recorder(config, source, camera, out)
-        of_state = problem or resume_remark(config, source)
-        said = (source.problem, of_state, observer.remark, *remarks(config, source, camera))
-        recorder.problems += filter(None, said)
+        resumed = refusal or resume_remark(config, source)
+        recorder.problems += filter(None, (source.problem, resumed, observer.remark))
+        recorder.problems += setting_remarks(config, source, camera)
         frames = observed_frames(source, last_observer)
         with recorder, closing(frames), ended_by_signals(source):
             shown = progress(frames, source.taken_count)
             for done in estimates(shown, config, source, tracker, smoothed):
                 recorder.add(done)
                 if viewer is not None:
-                    pose, lines = done.estimate.calibration.extrinsics, vertex_lines(done.seen.vertices)
-                    viewer.add(RecordedFrame(recorder.rows[-1], pose, lines), done.frame.image)
+                    viewer.add(_viewed(done, recorder.rows[-1]), done.frame.image)
         recorder.problems += source_remarks(source, files, len(recorder.rows))
-        tracked = sum(row.status == "TRACKING" for row in recorder.rows)
-        upside_down = upside_down_remark(observer, tracker, source, tracked, len(recorder.rows))
-        of_run = (unfit_mount_remark(config.mount, recorder.rows), upside_down)
-        recorder.problems += filter(None, of_run)
+        recorder.problems += result_remarks(config, source, observer, tracker, recorder.rows)
         last = last_frame(source, len(recorder.rows))
         saved = _save_tracker(tracker, camera, last, out)
         facts = run_facts(config, source, camera) | facts_of(reusing) | saved
@@ -136,6 +126,28 @@ def run(
         if config.formats:
             _write_formats(config, out, report, camera, source)
         return report
+
+
+def open_inputs(config: RunConfig) -> tuple[RunConfig, FrameSource, Camera]:
+    """Open the source and the camera, and check that the output folder may be written.
+
+    Returns:
+        the settings, which are those of a still if the source is one image; the source; the camera. A drive's
+        first frame has smaller standard deviations than a still, because the frames after it correct it.
+
+    Raises:
+        ValueError: see :func:`~lanebev.app.drive.sources.make_source` and
+            :func:`~lanebev.app.drive.sources.camera_of`; or the run would replace one of its inputs.
+    """
+    source = make_source(config)
+    if source.is_single and not (config.resume or config.smooth):
+        config = replace(config, stills=True)
+    check_inputs_stay(config.out, input_files(config, source))
+    check_new_or_of_run(config.out)
+    camera = camera_of(config, source)
+    source = match_image_size(camera, source)
+    logger.info("%s: %d frames of %d x %d", source.source, source.count, *reversed(camera.image_size))
+    return config, source, camera
 
 
 def estimates(
@@ -154,6 +166,11 @@ def estimates(
         estimate = filtered if smoothed is None else smoothed.of(filtered, frame.number)
         name = frame_name(frame, source)
         yield Recorded(frame=frame, name=name, seen=seen, estimate=estimate, filtered=filtered)
+
+
+def _viewed(done: Recorded, row: ExtrinsicsRow) -> RecordedFrame:
+    """Return a frame's results as the viewer takes them."""
+    return RecordedFrame(row, done.estimate.calibration.extrinsics, vertex_lines(done.seen.vertices))
 
 
 def _save_tracker(
@@ -178,19 +195,6 @@ def _write_formats(
         writer(name)(out / FORMATS[name].file, record, images)
 
 
-def open_for_run(config: RunConfig) -> tuple[RunConfig, FrameSource]:
-    """Open the source; the settings are those of a still if it is one image.
-
-    A drive's first frame has smaller standard deviations, because the frames after it correct it.
-
-    Raises:
-        ValueError: see :func:`~lanebev.app.drive.sources.make_source`.
-    """
-    source = make_source(config)
-    is_still = source.is_single and not (config.resume or config.smooth)
-    return (replace(config, stills=True) if is_still else config), source
-
-
 def resumed_tracker(config: RunConfig, camera: Camera) -> tuple[RunTracker, str | None]:
     """Make the tracker with the states to continue from; also return what is wrong with these."""
     tracker = make_tracker(config, camera)
@@ -213,11 +217,24 @@ def _recorder(config: RunConfig, source: FrameSource, camera: Camera, out: Outpu
     )
 
 
-def remarks(config: RunConfig, source: FrameSource, camera: Camera) -> list[str]:
+def setting_remarks(config: RunConfig, source: FrameSource, camera: Camera) -> list[str]:
     """Return remarks on an implausible camera, field of view or mount of the settings."""
     bars = "" if config.fov is None else bars_remark(first_image(source))
     mount = mount_remark(config.mount, camera)
     return [*filter(None, (bars, mount)), *camera_remarks(camera, source.pixel_aspect)]
+
+
+def result_remarks(
+    config: RunConfig,
+    source: FrameSource,
+    observer: Observer,
+    tracker: RunTracker,
+    rows: Sequence[ExtrinsicsRow],
+) -> list[str]:
+    """Return remarks on a mount that fits in no frame, and on images that are upside down."""
+    tracked = sum(row.status == "TRACKING" for row in rows)
+    upside_down = upside_down_remark(observer, tracker, source, tracked, len(rows))
+    return [*filter(None, (unfit_mount_remark(config.mount, rows), upside_down))]
 
 
 def first_pass(

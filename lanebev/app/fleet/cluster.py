@@ -1,17 +1,15 @@
 """Run tasks on Ray; the only module that imports it."""
 
-import contextlib
 import logging
 import os
 import signal
-from collections import Counter, deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
 from types import ModuleType
 
-from lanebev.app.drive.build import needs_network
-from lanebev.app.fleet.plan import Outcome, Task, is_done, write_mark
+from lanebev.app.fleet.plan import Outcome, Task
+from lanebev.app.fleet.queue import TaskQueue
 from lanebev.app.fleet.worker import run_tasks
 from lanebev.signals import handlers_kept
 
@@ -48,19 +46,6 @@ def check_ray() -> None:
         )
 
 
-def groups_of(tasks: Sequence[Task], batch: int) -> list[tuple[Task, ...]]:
-    """Return tasks in groups of up to ``batch`` for one network; those that need none, one by one."""
-    alike: dict[tuple[object, ...], list[Task]] = {}
-    for task in tasks:
-        config = task.config
-        shares = needs_network(config) and batch > 1
-        key = config.network if shares else (task.name,)
-        alike.setdefault(key, []).append(task)
-    return [
-        tuple(own[first : first + batch]) for own in alike.values() for first in range(0, len(own), batch)
-    ]
-
-
 def outcomes(tasks: Sequence[Task], cluster: Cluster) -> Iterator[Outcome]:
     """Run tasks and yield their outcomes, in the order in which they end.
 
@@ -74,7 +59,7 @@ def outcomes(tasks: Sequence[Task], cluster: Cluster) -> Iterator[Outcome]:
             num_cpus=cluster.cpus, num_gpus=cluster.gpus, max_retries=cluster.retries
         )
         most = max(16, round(_IN_FLIGHT * ray.cluster_resources().get("CPU", 1)))
-        queue = _Queue(tasks, cluster)
+        queue = TaskQueue(tasks, cluster.batch, cluster.retries)
         pending = dict[object, tuple[Task, ...]]()
         while queue.waiting or pending:
             while queue.waiting and len(pending) < most:
@@ -83,57 +68,22 @@ def outcomes(tasks: Sequence[Task], cluster: Cluster) -> Iterator[Outcome]:
             ready, _ = ray.wait(list(pending), num_returns=1)
             for each in ready:
                 group = pending.pop(each)
-                found, is_last = _found(ray, each, group)
+                found, may_retry = _found(ray, each, group)
                 ended = zip(group, found, strict=True)
-                yield from filter(None, (queue.end(task, outcome, is_last) for task, outcome in ended))
+                yield from filter(None, (queue.end(task, outcome, may_retry) for task, outcome in ended))
     finally:
         ray.shutdown()
 
 
-class _Queue:
-    """The groups of tasks that wait, and what follows when a task ends.
-
-    Args:
-        tasks: all of them.
-        cluster: how many are in a group, and how often a failed one is tried again.
-
-    Attributes:
-        waiting: groups of tasks in order.
-    """
-
-    def __init__(self, tasks: Sequence[Task], cluster: Cluster) -> None:
-        self._schedule, self._retries = Schedule(tasks), cluster.retries
-        self.waiting = deque(groups_of(self._schedule.first, cluster.batch))
-        self._failures, self._drives = Counter[str](), {task.name: task for task in tasks}
-
-    def end(self, task: Task, outcome: Outcome, is_last: bool) -> Outcome | None:
-        """Note what became of a task, and queue it again or the task that follows.
-
-        Returns:
-            the outcome of the drive, if it has ended.
-        """
-        self._failures[task.name] += bool(outcome.failure)
-        if outcome.failure and not is_last and self._failures[task.name] <= self._retries:
-            self.waiting.append((task,))
-            return None
-        follows, final = self._schedule.ended(task, outcome)
-        if follows is not None:
-            self.waiting.append((follows,))
-        if final is not None and final.is_final:
-            with contextlib.suppress(OSError):  # a full disk: the next call tries it again
-                write_mark(self._drives[final.name], final)
-        return final
-
-
 def _found(ray: ModuleType, reference: object, group: Sequence[Task]) -> tuple[Sequence[Outcome], bool]:
-    """Return what became of a group, and whether Ray has used all its retries."""
+    """Return the outcomes of a group, and whether its tasks may run again: Ray ran one alone often enough."""
     try:
         found: Sequence[Outcome] = ray.get(reference)
     except ray.exceptions.RayError as error:  # its worker died again and again
         first = str(error).strip().splitlines()[0]
         words = f"its worker died: {type(error).__name__}: {first}"
-        return [Outcome(task.name, failure=words) for task in group], len(group) == 1
-    return found, False
+        return [Outcome(task.name, failure=words) for task in group], len(group) > 1
+    return found, True
 
 
 def _started(cluster: Cluster) -> ModuleType:
@@ -169,41 +119,3 @@ def _started(cluster: Cluster) -> ModuleType:
         ) from error
     module: ModuleType = ray
     return module
-
-
-class Schedule:
-    """The drives that are to be run.
-
-    Args:
-        tasks: tasks of the drives. Unfinished parts of drives start first.
-    """
-
-    def __init__(self, tasks: Sequence[Task]) -> None:
-        self._drive_of: dict[str, Task] = {}
-        self._left: dict[str, int] = {}
-        self._failed: dict[str, Outcome] = {}
-        self.first: list[Task] = []
-        for task in tasks:
-            parts = [part for part in task.parts if not is_done(part)]
-            self._drive_of |= {part.name: task for part in parts}
-            self._left[task.name] = len(parts)
-            self.first += parts or [task]
-
-    def ended(self, task: Task, outcome: Outcome) -> tuple[Task | None, Outcome | None]:
-        """Note what became of a task.
-
-        Returns:
-            the task that can begin now, and what became of a drive; None where there is none.
-        """
-        if not task.is_part:
-            return None, outcome
-        drive = self._drive_of[task.name]
-        self._left[drive.name] -= 1
-        if outcome.failure:
-            self._failed.setdefault(drive.name, outcome)
-        if self._left[drive.name]:
-            return None, None
-        failed = self._failed.get(drive.name)
-        if failed is None:
-            return drive, None
-        return None, Outcome(drive.name, f"{failed.name}: {failed.failure}", is_final=failed.is_final)

@@ -13,7 +13,6 @@ from lanebev.app.continued.part_observation import observe_part
 from lanebev.app.demo import write_drive
 from lanebev.app.drive.observers import NetworkObserver
 from lanebev.app.fleet import worker
-from lanebev.app.fleet.cluster import Schedule
 from lanebev.app.fleet.manifest import Drive
 from lanebev.app.fleet.plan import (
     Outcome,
@@ -25,6 +24,7 @@ from lanebev.app.fleet.plan import (
     tasks_of,
     write_mark,
 )
+from lanebev.app.fleet.queue import TaskQueue
 from lanebev.app.run import run
 from lanebev.io.state import load_state
 from lanebev.io.video.writer import VideoWriter
@@ -88,20 +88,24 @@ def test_parts_come_first_and_the_whole_when_all_are_there(tmp_path, drive):
     task.parts[1].result.write_text("")
     write_mark(task.parts[1], Outcome(task.parts[1].name, frames=15))
     assert is_done(task.parts[1])
-    schedule = Schedule([task])
-    assert schedule.first == [task.parts[0], task.parts[2]]
-    assert schedule.ended(task.parts[0], Outcome("one, part 0")) == (None, None)
-    assert schedule.ended(task.parts[2], Outcome("one, part 2")) == (task, None)
-    assert schedule.ended(task, Outcome("one", frames=3)) == (None, Outcome("one", frames=3))
+    queue = TaskQueue([task], batch=1, retries=0)
+    assert [queue.waiting.popleft() for _ in range(2)] == [(task.parts[0],), (task.parts[2],)]
+    assert queue.end(task.parts[0], Outcome("one, part 0")) is None
+    assert not queue.waiting
+    assert queue.end(task.parts[2], Outcome("one, part 2")) is None
+    assert list(queue.waiting) == [(task,)]
+    assert queue.end(task, Outcome("one", frames=3)) == Outcome("one", frames=3)
 
 
 def test_a_part_that_fails_fails_the_drive(tmp_path, drive):
     task = tasks_of([drive], tmp_path, 3.0)["one"]
-    schedule = Schedule([task])
+    queue = TaskQueue([task], batch=1, retries=0)
+    queue.waiting.clear()
     bad = Outcome(task.parts[1].name, failure="no", is_final=True)
     for part, outcome in zip(task.parts, (Outcome("one, part 0"), bad, Outcome("one, part 2")), strict=True):
-        follows, told = schedule.ended(part, outcome)
-    assert (follows, told) == (None, Outcome("one", failure="one, part 1: no", is_final=True))
+        ended = queue.end(part, outcome)
+    assert ended == Outcome("one", failure="one, part 1: no", is_final=True)
+    assert not queue.waiting
 
 
 @pytest.mark.slow

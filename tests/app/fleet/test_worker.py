@@ -12,8 +12,9 @@ from lanebev.app.config import RunConfig
 from lanebev.app.demo import write_drive
 from lanebev.app.drive.shared_network import SharedNetwork
 from lanebev.app.fleet import cluster, worker
-from lanebev.app.fleet.cluster import Cluster, groups_of, outcomes
+from lanebev.app.fleet.cluster import Cluster, outcomes
 from lanebev.app.fleet.plan import Outcome, Task
+from lanebev.app.fleet.queue import groups_of
 from lanebev.app.run import run
 from lanebev.observation.boundary_vertices import BoundaryVertices
 from lanebev.pipeline import LaneBEV
