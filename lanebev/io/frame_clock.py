@@ -11,7 +11,7 @@ from lanebev.numbers import check_number
 logger = logging.getLogger(__name__)
 
 FIRST_DT = 1 / 30  # s before a first frame: it has no frame before
-_LONG_DT = 5.0  # s; if all steps are longer, the stamps are probably not seconds
+_SHORT_DT, _LONG_DT = 2e-3, 5.0  # s; if all steps are shorter or longer, the stamps are probably not seconds
 _LOOKED_AT = 5  # number of steps that are checked for that
 
 
@@ -56,12 +56,13 @@ class FrameClock:
         was_odd, self.steps = _are_odd(self.steps), [*self.steps[-_LOOKED_AT + 1 :], dt]
         if not _are_odd(self.steps):
             return dt, []
-        remark = f"time stamps advance by {dt:g} a frame: expected seconds, got milli- or nanoseconds?"
+        units = "minutes or days" if dt < 1 else "milli- or nanoseconds"
+        remark = f"time stamps advance by {dt:g} a frame: expected seconds, got {units}?"
         if not was_odd:  # once, as long as it lasts
             logger.warning(remark)
         return dt, [remark]
 
 
 def _are_odd(steps: Sequence[float]) -> bool:
-    """Tell whether all of some time steps (s) are longer than those of a camera."""
-    return len(steps) == _LOOKED_AT and min(steps) > _LONG_DT
+    """Tell whether all of some time steps (s) are shorter, or all longer, than those of a camera."""
+    return len(steps) == _LOOKED_AT and (max(steps) < _SHORT_DT or min(steps) > _LONG_DT)

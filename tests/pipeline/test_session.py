@@ -84,11 +84,14 @@ def test_a_clock_that_was_set_back_does_not_end_a_session():
     assert result.reasons == []
 
 
-def test_milliseconds_are_noticed(caplog):
+@pytest.mark.parametrize(
+    ("step", "units"), [(33.0, "milli- or nanoseconds"), (1 / 30 / 60, "minutes or days")]
+)
+def test_other_units_of_time_are_noticed(caplog, step, units):
     session = Session(CAMERA)
-    said = [session(polylines=lines(), stamp=33.0 * k).reasons for k in range(8)]
+    said = [session(polylines=lines(), stamp=step * k).reasons for k in range(8)]
     assert not any("expected seconds" in text for texts in said[:5] for text in texts)
-    assert any("expected seconds, got milli- or nanoseconds?" in text for text in said[6])
+    assert any(f"expected seconds, got {units}?" in text for text in said[6])
     assert len(caplog.records) == 1  # not in every frame
 
 

@@ -31,7 +31,7 @@ from lanebev.signals import handlers_kept
 
 _RECTIFIED = re.compile(r"(?:^|[/_])rect(?:ified)?(?:[/_]|$)")  # in topics of ROS's image_proc, which P is of
 _MOST_WITHOUT = 0.5  # fraction of the frames, that may be without speed
-_LONG_STEP = 5  # s between frames, in which a pose has nothing to do with the one before
+_SHORT_STEP, _LONG_STEP = Fraction(1, 500), 5  # s between frames of a drive
 
 
 def make_source(config: RunConfig, may_take_none: bool = False) -> FrameSource:
@@ -74,8 +74,9 @@ def _stream(config: RunConfig, selection: Selection) -> FrameSource:
 def _remarks_on_drive(config: RunConfig, found: FrameSource) -> Iterator[str]:
     """Yield remarks, some of them empty, on the times of frames and on images of several drives."""
     step = config.every / found.fps
-    if (found.paths or found.times) and found.count > 1 and step > _LONG_STEP:
-        yield f"its frames are {float(step):.3g} s apart; is the frame rate right? if so, use --stills"
+    if found.count > 1 and not _SHORT_STEP <= step <= _LONG_STEP:
+        remedy = "if so, use --stills" if step > 1 else "if not, give its frames as images, and --fps"
+        yield f"its frames are {float(step):.3g} s apart; is the frame rate right? {remedy}"
     if not found.paths:
         return
     yield found.untimed

@@ -27,12 +27,23 @@ def test_links_that_lead_nowhere_are_lost_frames(tmp_path):
     ]
 
 
-@pytest.mark.parametrize(("settings", "is_slow"), [({"fps": 1 / 30}, True), ({"fps": 0.5}, False),
-                                                   ({"fps": 1 / 30, "stills": True}, False)])  # fmt: skip
-def test_frames_that_are_half_a_minute_apart_are_said(tmp_path, settings, is_slow):
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"fps": 1 / 30}, "30 s apart; is the frame rate right? if so, use --stills"),
+        ({"fps": 0.5}, ""),
+        ({"fps": 240.0}, ""),
+        ({"fps": 1 / 30, "stills": True}, ""),
+        (
+            {"fps": 1e4},
+            "0.0001 s apart; is the frame rate right? if not, give its frames as images, and --fps",
+        ),
+    ],
+)
+def test_steps_of_no_camera_are_said(tmp_path, settings, words):
     folder = str(_folder(tmp_path / "a", "1.png", "2.png"))
-    words = f"{folder}: its frames are 30 s apart; is the frame rate right? if so, use --stills"
-    assert make_source(RunConfig(folder, "c", **settings)).problem == (words if is_slow else "")
+    problem = make_source(RunConfig(folder, "c", **settings)).problem
+    assert problem == (f"{folder}: its frames are {words}" if words else "")
 
 
 def _picture():
