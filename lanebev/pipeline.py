@@ -219,62 +219,71 @@ class LaneBEV(BoundaryDetector):
 
         Raises:
             ValueError: shapes or devices that don't fit, or an image of whole numbers.
+            TypeError: a speed, and a calibrator that takes none.
         """
         check_images(image)
         cameras = frame_cameras(intrinsics, image)
         check_distortion(distortion, model, image.shape[0])
         if truncation is not None and truncation < 1:
             raise ValueError(f"truncation: expected 1 frame or more, or None, got {truncation}")
-        frames = image if image.ndim == 5 else image.unsqueeze(1)
-        batch, steps = frames.shape[:2]
-        speeds = None if speed is None else per_frame("speed", speed, batch, steps, intrinsics)
-        with_speed: Any = getattr(self.calibrator, "with_speed", None)
-        if with_speed is None and speeds is not None:
+        if speed is not None and not hasattr(self.calibrator, "with_speed"):
             got = type(self.calibrator).__qualname__
             raise TypeError(f"speed: expected a calibrator with a method with_speed, got {got}; leave it out")
+        frames = image if image.ndim == 5 else image.unsqueeze(1)
+        batch, steps = frames.shape[:2]
+        intervals = per_frame("dt", dt, batch, steps, intrinsics)
+        speeds = None if speed is None else per_frame("speed", speed, batch, steps, intrinsics)
         begins = None if reset is None else drive_starts(reset, batch, steps)
-        given = {"intrinsics": intrinsics, "distortion": distortion, "reset": begins}
-        check_devices({"image": image, **given})
+        check_devices({"image": image, "intrinsics": intrinsics, "distortion": distortion, "reset": begins})
         doubt_intrinsics(intrinsics, (image.shape[-2], image.shape[-1]))
         if state is None or begins is not None:
             dtype = common_dtype(intrinsics) if state is None else state[0].dtype
             fresh = self.initial_state(batch, dtype, image.device)
             state = fresh if state is None else state
         clips = None if self.far_view else self._observe_clips(frames, cameras, distortion, model)
-        intervals = per_frame("dt", dt, batch, steps, intrinsics)
         outputs = []
         for step in range(steps):
+            frame, lens = frames[:, step], (cameras[:, step], distortion, model)
             if begins is not None:
                 state = select_rows(begins[:, step], fresh, state)
             if truncation is not None and step % truncation == 0:
                 state = state.detach()
-            camera = cameras[:, step]
             if clips is None:  # the state before the frame places the far view
-                lens = (camera, distortion, model)
                 point = expected_vanishing_point(self.calibrator, state, *lens)
-                logits, segments = self.observe(frames[:, step], *lens, vanishing_point=point)
+                logits, segments = self.observe(frame, *lens, vanishing_point=point)
             else:
                 logits, segments = clips[0][:, step], LaneSegments(*(part[:, step] for part in clips[1]))
             self._check_channels(logits)
-            with self._gradients("calibrator"):
-                calibration, state = self.calibrator(segments, camera, state, intervals[:, step], lane_width)
-                calibration = self._scaled(calibration, state)
-                if speeds is not None:
-                    state = with_speed(state, speeds[:, step])
-            view, valid = None, None
-            if bev:
-                pose = calibration.extrinsics
-                view, valid = self._view(frames[:, step], camera, distortion, model, pose, state)
-            homography = bev_from_image(calibration.extrinsics, camera, self.warp.grid)
+            moving = None if speeds is None else speeds[:, step]
+            calibration, state = self._calibrate(
+                segments, cameras[:, step], state, intervals[:, step], lane_width, moving
+            )
+            view, valid = self._view(frame, *lens, calibration.extrinsics, state) if bev else (None, None)
+            homography = bev_from_image(calibration.extrinsics, cameras[:, step], self.warp.grid)
             outputs.append(LaneBEVOutput(view, valid, calibration, homography, segments, logits))
         output = outputs[0] if image.ndim == 4 else join_tensors(lambda each: torch.stack(each, 1), outputs)
         return output, state
 
-    def _scaled(self, calibration: Calibration, state: Any) -> Calibration:
-        """Scale the standard deviations of the pose by the network's factor."""
-        if not isinstance(self.calibrator, Calibrator):
-            return calibration.with_std_scaled(self.pose_sigma_scale)
-        return self.calibrator.scale_drive(calibration, state, self.pose_sigma_scale)
+    def _calibrate(
+        self,
+        segments: LaneSegments,
+        intrinsics: Tensor,
+        state: Any,
+        dt: Tensor,
+        lane_width: float | Tensor,
+        speed: Tensor | None,
+    ) -> tuple[Calibration, Any]:
+        """Calibrate by the segments of a frame, with the network's factor on the standard deviations."""
+        with self._gradients("calibrator"):
+            calibration, state = self.calibrator(segments, intrinsics, state, dt, lane_width)
+            if isinstance(self.calibrator, Calibrator):
+                calibration = self.calibrator.scale_drive(calibration, state, self.pose_sigma_scale)
+            else:
+                calibration = calibration.with_std_scaled(self.pose_sigma_scale)
+            if speed is not None:
+                with_speed: Any = self.calibrator.with_speed
+                state = with_speed(state, speed)
+        return calibration, state
 
     def _check_channels(self, logits: Tensor) -> None:
         """Raise unless the network has a map of each boundary that the calibrator numbers, and background."""
@@ -296,8 +305,10 @@ class LaneBEV(BoundaryDetector):
     ) -> tuple[Tensor, Tensor]:
         """Resample images (B, 3, H, W), which count as black if they are not finite."""
         usable, finite = black_unless_finite(image)
+        vertical_curvature = getattr(self.calibrator, "vertical_curvature", lambda _: None)
         with self._gradients("warp"):
-            road = self._road_shape(state)
+            curvature = vertical_curvature(state)  # None: the road is a plane
+            road = {} if curvature is None else {"vertical_curvature": curvature}
             view, valid = self.warp(usable, intrinsics, extrinsics, distortion, model, **road)
         if usable is not image:
             valid = select_rows(finite, valid, torch.zeros_like(valid))
@@ -339,11 +350,6 @@ class LaneBEV(BoundaryDetector):
         logits, vertices = self.boundary_vertices(image, vanishing_point)
         with self._gradients("extractor"):
             return logits, segments_from_vertices(vertices, intrinsics, distortion, model)
-
-    def _road_shape(self, state: Any) -> dict[str, Tensor]:
-        """Return the argument of the warp that describes a road that is not a plane, if there is one."""
-        curvature = getattr(self.calibrator, "vertical_curvature", lambda _: None)(state)
-        return {} if curvature is None else {"vertical_curvature": curvature}
 
 
 def _configured(part: nn.Module, name: str, default: Any = None) -> Any:
