@@ -31,7 +31,7 @@ def bare_world(sampler: BatchSampler, kind: str = "highway") -> tuple[World, tor
         opacity=zero + 1,
         wear=zero - 2,
         stud_period=zero,
-        missing_length=zero,
+        gaps=layout.gaps._replace(length=zero),
         ghost=zero,
         colour=torch.full_like(layout.colour, 0.8),
         stripe_width=zero + 0.04,  # wide ones look lopsided: their near half is larger

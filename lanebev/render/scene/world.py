@@ -46,7 +46,7 @@ from lanebev.render.scene.places.winter import Winter, sample_winter, snowed_lay
 from lanebev.render.scene.places.works import Works, sample_works, works_traffic
 from lanebev.render.scene.road.alignment import Alignment
 from lanebev.render.scene.road.city_layout import sample_city_layout
-from lanebev.render.scene.road.layout import Layout, sample_layout
+from lanebev.render.scene.road.layout import Gaps, Layout, sample_layout
 from lanebev.render.scene.road.pavement import Pavement, sample_pavement
 from lanebev.render.scene.sampler import BatchSampler
 
@@ -146,7 +146,7 @@ def sample_world(sampler: BatchSampler, kind: str) -> tuple[World, Tensor]:
         sampler: the randomness.
         kind: see :func:`~lanebev.render.scene.kinds.sample_kinds`.
     """
-    more = sampler if kind != "highway" else sampler.beside()  # a highway's own draws are what they were
+    more = sampler if kind != "highway" else sampler.beside()  # draws for other kinds do not change a highway
     kinds = sample_kinds(more, kind)
     dotted = sampler.chance(0.35)
     bright = sampler.chance(0.12) & ~dotted
@@ -158,12 +158,7 @@ def sample_world(sampler: BatchSampler, kind: str) -> tuple[World, Tensor]:
     layout, ego_lane = country_layout(more, kinds.country, layout, ego_lane)
     layout, works = sample_works(more, kinds.works, layout)
     layout = snowed_layout(more, kinds.snow, layout)
-    weather = sample_weather(sampler)
-    sunny = bright | (dotted & sampler.chance(0.7))
-    weather = weather._replace(
-        kind=torch.where(sunny, CLEAR, weather.kind), grey=torch.where(sunny, 0.1, weather.grey)
-    )
-    weather = varied_weather(more, kinds, weather)
+    weather = varied_weather(more, kinds, _sample_weather(sampler, dotted, bright))
     pavement = sample_pavement(sampler, layout, dotted, bright, weather.wet, median)
     pavement = street_edges(more, kinds.city, street, layout, pavement)
     pavement = country_pavement(more, kinds.country, layout, pavement)
@@ -176,10 +171,9 @@ def sample_world(sampler: BatchSampler, kind: str) -> tuple[World, Tensor]:
     surroundings = tunnel_surroundings(more, kinds.tunnel, tunnel, pavement, surroundings)
     lights = sample_lights(more, kinds.night, pavement.left, pavement.right)
     surroundings = _tinted(surroundings, weather, lights)
-    begin = sampler.sometimes(0.25, -6, 140, otherwise=math.inf)
+    begin = sampler.sometimes(0.25, -6, 140, otherwise=math.inf)  # of a bridge
     begin = torch.where((kinds.city & more.chance(0.75)) | kinds.country | kinds.tunnel, math.inf, begin)
     extent = sampler.uniform(6, 30)
-    bridge = torch.stack([begin, begin + extent], dim=1)
     traffic = sample_traffic(sampler, layout, ego_lane, surroundings.opposite, pavement, begin, extent)
     traffic = city_traffic(more, kinds.city, street, layout, pavement, traffic)
     traffic = works_traffic(more, kinds.works, layout, traffic, NUM_PARKED)
@@ -195,7 +189,7 @@ def sample_world(sampler: BatchSampler, kind: str) -> tuple[World, Tensor]:
         traffic=traffic,
         weather=weather,
         sensor=sensor,
-        bridge=bridge,
+        bridge=torch.stack([begin, begin + extent], dim=1),
         shade=torch.where(kinds.tunnel, 0.0, shade),
         kinds=kinds,
         street=street,
@@ -208,18 +202,24 @@ def sample_world(sampler: BatchSampler, kind: str) -> tuple[World, Tensor]:
     return world, ego_lane
 
 
+def _sample_weather(sampler: BatchSampler, dotted: Tensor, bright: Tensor) -> Weather:
+    """Sample the weather: clear over bleached concrete, and mostly clear over Californian studs."""
+    weather = sample_weather(sampler)
+    sunny = bright | (dotted & sampler.chance(0.7))
+    return weather._replace(
+        kind=torch.where(sunny, CLEAR, weather.kind), grey=torch.where(sunny, 0.1, weather.grey)
+    )
+
+
 def _with_street(
     sampler: BatchSampler, kinds: Kinds, layout: Layout, ego_lane: Tensor
 ) -> tuple[Layout, Tensor, Street]:
     """Replace highways by streets where a world is in a city."""
     city, lane, first, own = sample_city_layout(sampler, layout)
     street = sample_street(sampler, city, lane, first, own)
-    sampler.uniform(0, 1)  # for nothing: what is drawn after it stays as it was
-    city = city._replace(
-        missing_period=street.junction_period[:, None].expand_as(city.across),
-        missing_length=street.junction_length[:, None].expand_as(city.across),
-        missing_phase=street.phase[:, None].expand_as(city.across),
-    )
+    sampler.uniform(0, 1)  # not used, but all later draws depend on it
+    junctions = (street.junction_period, street.junction_length, street.phase)
+    city = city._replace(gaps=Gaps(*(each[:, None].expand_as(city.across) for each in junctions)))
     return (
         select_rows(kinds.city, city, layout),
         torch.where(kinds.city, lane, ego_lane),
@@ -229,9 +229,9 @@ def _with_street(
 
 def moved_along(world: World, start: Tensor) -> World:
     """Return the same worlds with everything placed from ``start`` (B,) m on instead of from zero."""
-    shift = start[:, None]
+    shift, gaps = start[:, None], world.layout.gaps
     return world._replace(
-        layout=world.layout._replace(missing_phase=world.layout.missing_phase - shift),
+        layout=world.layout._replace(gaps=gaps._replace(phase=gaps.phase - shift)),
         pavement=world.pavement._replace(deck_phase=world.pavement.deck_phase - start),
         traffic=world.traffic._replace(along=world.traffic.along + shift),
         bridge=world.bridge + shift,

@@ -131,7 +131,7 @@ def features_of(scene: Scene) -> Features:
         studs=some(layout.stud_period),
         double=some(layout.separation),
         ghost=some(layout.ghost),
-        symbols=some(layout.symbol),
+        symbols=some(layout.symbols.kind),
         night=some(world.lights.on),
         rows=KindRows(
             city=_rows(kinds.city),

@@ -24,17 +24,18 @@ def symbols(layout: Layout, ground: Ground, lane: Tensor) -> Tensor:
     """
     covered = torch.zeros_like(ground.along)
     between = (lane - 1).clamp(0, MAX_BOUNDARIES - 2)
-    period, phase = layout.symbol_period[:, None], layout.symbol_phase[:, None]
+    painted = layout.symbols
+    period, phase = painted.period[:, None], painted.phase[:, None]
     position = remainder(ground.along + phase, period)
     inner = (lane >= 1) & (lane < MAX_BOUNDARIES)
-    there = (layout.symbol > NO_SYMBOL).gather(1, between) & (position < _LENGTH + 2) & inner
+    there = (painted.kind > NO_SYMBOL).gather(1, between) & (position < _LENGTH + 2) & inner
     row, at = there.nonzero(as_tuple=True)
     if not len(at):
         return covered
     lane = between[row, at]
     x = ground.across[row, at] - 0.5 * (layout.across[row, lane] + layout.across[row, lane + 1])
     y = position[row, at] - 1.0
-    kind, wide, far = layout.symbol[row, lane], ground.reach_across[row, at], ground.reach_along[row, at]
+    kind, wide, far = painted.kind[row, lane], ground.reach_across[row, at], ground.reach_along[row, at]
     seed = ((ground.along + phase) / period)[row, at].floor() + 7.0 * lane
     shapes = torch.stack(
         [
@@ -45,7 +46,7 @@ def symbols(layout: Layout, ground: Ground, lane: Tensor) -> Tensor:
         ]
     )
     value = shapes.gather(0, (kind - 1)[None])[0]
-    covered[row, at] = value * layout.symbol_opacity[row]
+    covered[row, at] = value * painted.opacity[row]
     return covered
 
 

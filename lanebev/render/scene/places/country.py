@@ -18,7 +18,7 @@ from lanebev.render.scene.objects.surroundings import (
     TREES,
     Surroundings,
 )
-from lanebev.render.scene.road.layout import DASHED, MAX_BOUNDARIES, NONE, SOLID, Layout
+from lanebev.render.scene.road.layout import DASHED, MAX_BOUNDARIES, NONE, SOLID, Layout, no_symbols
 from lanebev.render.scene.road.pavement import Pavement
 from lanebev.render.scene.sampler import BatchSampler
 
@@ -53,7 +53,7 @@ def country_layout(
         opacity=torch.where(kind == NONE, 0.0, sampler.uniform(0.4, 1.0, 1)),
         stud_period=torch.zeros_like(layout.stud_period),
         ghost=torch.zeros_like(layout.ghost),
-        symbol=torch.zeros_like(layout.symbol),
+        symbols=no_symbols(layout.symbols),
     )
     lane = (sampler.chance(0.85) & (lanes == 2)).long()
     return select_rows(country, narrow, layout), torch.where(country, lane, ego_lane)

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from lanebev.render.scene.road.layout import MAX_BOUNDARIES, Layout
+from lanebev.render.scene.road.layout import MAX_BOUNDARIES, Gaps, Layout
 from lanebev.render.scene.sampler import BatchSampler
 
 
@@ -55,8 +55,6 @@ def snowed_layout(sampler: BatchSampler, snow: Tensor, layout: Layout) -> Layout
     long = sampler.uniform(10, 60, slots)
     covered = snow[:, None] & sampler.chance(0.6, slots)
     period = long / sampler.uniform(0.25, 0.9, 1)
-    return layout._replace(
-        missing_period=torch.where(covered, period, layout.missing_period),
-        missing_length=torch.where(covered, long, layout.missing_length),
-        missing_phase=torch.where(covered, sampler.uniform(0, 60, slots), layout.missing_phase),
-    )
+    hidden = Gaps(period, long, sampler.uniform(0, 60, slots))
+    gaps = (torch.where(covered, *pair) for pair in zip(hidden, layout.gaps, strict=True))
+    return layout._replace(gaps=Gaps(*gaps))

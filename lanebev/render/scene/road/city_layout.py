@@ -14,6 +14,7 @@ from lanebev.render.scene.road.layout import (
     Layout,
     boundary_places,
     dashes_of_lines,
+    no_symbols,
 )
 from lanebev.render.scene.sampler import BatchSampler
 
@@ -52,9 +53,10 @@ def sample_city_layout(sampler: BatchSampler, base: Layout) -> tuple[Layout, Ten
     uneven = sampler.normal(0.2, slots - 1).clamp(-0.5, 0.5) * sampler.chance(0.7, 1)
     across = boundary_places((lane_width[:, None] + uneven).clamp(2.4, 4.3), exists)
 
-    kind = sampler.pick([0.0, 0.12, 0.88, 0, 0, 0], slots)
-    kind = torch.where(middle, sampler.pick([0.04, 0.24, 0.42, 0.22, 0, 0.08], slots), kind)
-    kind = torch.where(outer, sampler.pick([0.42, 0.38, 0.17, 0.03, 0, 0], slots), kind)
+    divider = sampler.pick([0.0, 0.12, 0.88, 0, 0, 0], slots)
+    centre_line = sampler.pick([0.04, 0.24, 0.42, 0.22, 0, 0.08], slots)
+    edge = sampler.pick([0.42, 0.38, 0.17, 0.03, 0, 0], slots)
+    kind = torch.where(outer, edge, torch.where(middle, centre_line, divider))
     dashes = sampler.pick_from(DASHES, 1).expand(-1, slots, -1)
     dashes = torch.where(sampler.chance(0.15, slots)[..., None], sampler.pick_from(DASHES, slots), dashes)
     blocks = outer & sampler.chance(0.6, slots)
@@ -80,7 +82,7 @@ def sample_city_layout(sampler: BatchSampler, base: Layout) -> tuple[Layout, Ten
         colour=colour.expand(-1, slots, -1).contiguous(),
         opacity=torch.where(kind == NONE, 0.0, opacity),
         stud_period=torch.zeros_like(width).expand(-1, slots).contiguous(),
-        symbol=torch.zeros_like(base.symbol),
+        symbols=no_symbols(base.symbols),
     )
     ego_lane = first + (sampler.uniform(0, 1) * own).long().minimum(own - 1)
     return layout, ego_lane, first, own

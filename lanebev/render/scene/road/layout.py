@@ -17,6 +17,36 @@ DASHES = [  # (length, period) m: US, California, Germany twice, UK, France, Jap
 NONE, SOLID, DASHED, DOUBLE, STUDS, SOLID_DASHED = range(6)
 
 
+class Gaps(NamedTuple):
+    """Where boundaries are not painted: over the first ``length`` m of each ``period`` m, (B, K) each.
+
+    Attributes:
+        period: m.
+        length: m; 0 is none.
+        phase: m.
+    """
+
+    period: Tensor
+    length: Tensor
+    phase: Tensor
+
+
+class Symbols(NamedTuple):
+    """What is painted in lanes of highways, (B,) unless said otherwise.
+
+    Attributes:
+        kind: (B, K) int64, in the lane right of each boundary, see raster/road/symbols.py; 0 is nothing.
+        period: m.
+        phase: m.
+        opacity: [0, 1].
+    """
+
+    kind: Tensor
+    period: Tensor
+    phase: Tensor
+    opacity: Tensor
+
+
 class Layout(NamedTuple):
     """A road's boundaries, (B, K) each unless said otherwise, left to right.
 
@@ -34,15 +64,10 @@ class Layout(NamedTuple):
         wear: [0, 1], how unevenly it went.
         stud_period: m; 0 is none. A group of four dots, 1.22 m apart, then a gap, as in California.
         stud_group: m, length of a group.
-        missing_period: m; the boundary is not painted over the first ``missing_length`` of it.
-        missing_length: m; 0 is none.
-        missing_phase: m.
+        gaps: where there is no paint.
         ghost: [0, 1] strength of an old line, repainted beside this one.
         ghost_shift: m from the boundary to it.
-        symbol: int64, what is painted in the lane right of each boundary, see symbols.py; 0 is nothing.
-        symbol_period: (B,) m.
-        symbol_phase: (B,) m.
-        symbol_opacity: (B,) in [0, 1].
+        symbols: in lanes.
     """
 
     across: Tensor
@@ -58,15 +83,10 @@ class Layout(NamedTuple):
     wear: Tensor
     stud_period: Tensor
     stud_group: Tensor
-    missing_period: Tensor
-    missing_length: Tensor
-    missing_phase: Tensor
+    gaps: Gaps
     ghost: Tensor
     ghost_shift: Tensor
-    symbol: Tensor
-    symbol_period: Tensor
-    symbol_phase: Tensor
-    symbol_opacity: Tensor
+    symbols: Symbols
 
     def last_across(self) -> Tensor:
         """Return the place of the last boundary, (B,) m."""
@@ -95,20 +115,11 @@ def sample_layout(sampler: BatchSampler, dotted: Tensor, faint: Tensor) -> Layou
     last = (count - 1)[:, None]
     outer = (index == 0) | (index == last)
     kind = _kinds_of_lines(sampler, dotted, outer)
-    dashes = sampler.pick_from(DASHES, 1).expand(-1, slots, -1).clone()
-    other = sampler.pick_from(DASHES, slots)
-    dashes = torch.where(sampler.chance(0.1, slots)[..., None], other, dashes)
-    dashes = dashes * sampler.uniform(0.9, 1.1, 1, 1)
-    dash = dashes_of_lines(kind, dashes)
+    dash = dashes_of_lines(kind, _dashes(sampler))
     double = (kind == DOUBLE) | (kind == SOLID_DASHED)
     width, colour, opacity = _paint(sampler, faint, outer)
-
-    stud = kind == STUDS
-    reflectors = sampler.chance(0.35, 1) & sampler.chance(0.8, slots) & (kind != NONE)
-    fraction = sampler.uniform(0.0, 1.0)[:, None]
-    stud_period = torch.where(stud | reflectors, torch.where(fraction < 0.85, 14.63, 7.32), 0.0)
-    stud_group = torch.where(stud, torch.where(fraction < 0.85, 4.6, 7.4), 0.3)
-    missing = sampler.chance(0.07, slots) & (kind != NONE)
+    stud_period, stud_group = _studs(sampler, kind)
+    has_gaps = sampler.chance(0.07, slots) & (kind != NONE)
     return Layout(
         across=across,
         exists=exists,
@@ -120,22 +131,31 @@ def sample_layout(sampler: BatchSampler, dotted: Tensor, faint: Tensor) -> Layou
         dash_phase=sampler.uniform(0, 20, 1)
         + torch.where(sampler.chance(0.2, 1), sampler.uniform(0, 20, slots), 0.0),
         colour=colour.clamp(0.02, 0.95).expand(-1, slots, -1).contiguous(),
-        opacity=torch.where(stud | (kind == NONE), 0.0, opacity),
+        opacity=torch.where((kind == STUDS) | (kind == NONE), 0.0, opacity),
         wear=sampler.either(0.5, (0.0, 0.3), (0.2, 0.65))[:, None].repeat(1, slots),
-        stud_period=stud_period.contiguous(),
-        stud_group=stud_group.expand(-1, slots).contiguous(),
-        missing_period=sampler.uniform(150, 500, slots),
-        missing_length=torch.where(missing, sampler.uniform(15, 90, slots), 0.0),
-        missing_phase=sampler.uniform(-60, 40, slots),
+        stud_period=stud_period,
+        stud_group=stud_group,
+        gaps=Gaps(
+            period=sampler.uniform(150, 500, slots),
+            length=torch.where(has_gaps, sampler.uniform(15, 90, slots), 0.0),
+            phase=sampler.uniform(-60, 40, slots),
+        ),
         ghost=sampler.sometimes(0.1, 0.1, 0.45, 1).expand(-1, slots).contiguous(),
         ghost_shift=sampler.uniform(-0.5, 0.5, slots),
-        symbol=torch.where(
-            sampler.chance(0.15, 1) & sampler.chance(0.6, slots), sampler.pick([0, 3, 1, 2, 1], slots), 0
+        symbols=Symbols(
+            kind=torch.where(
+                sampler.chance(0.15, 1) & sampler.chance(0.6, slots), sampler.pick([0, 3, 1, 2, 1], slots), 0
+            ),
+            period=sampler.uniform(25, 150),
+            phase=sampler.uniform(0, 150),
+            opacity=sampler.uniform(0.5, 1.0),
         ),
-        symbol_period=sampler.uniform(25, 150),
-        symbol_phase=sampler.uniform(0, 150),
-        symbol_opacity=sampler.uniform(0.5, 1.0),
     )
+
+
+def no_symbols(like: Symbols) -> Symbols:
+    """Return symbols of which none is painted."""
+    return like._replace(kind=torch.zeros_like(like.kind))
 
 
 def boundary_places(widths: Tensor, exists: Tensor) -> Tensor:
@@ -173,6 +193,23 @@ def _paint(sampler: BatchSampler, faint: Tensor, outer: Tensor) -> tuple[Tensor,
     return width, colour, torch.where(faint[:, None], sampler.uniform(0.4, 0.9, 1), opacity)
 
 
+def _dashes(sampler: BatchSampler) -> Tensor:
+    """Sample (length, period) of the dashes, (B, K, 2) m: mostly the same for all lines of a road."""
+    dashes = sampler.pick_from(DASHES, 1)
+    other = sampler.pick_from(DASHES, MAX_BOUNDARIES)
+    dashes = torch.where(sampler.chance(0.1, MAX_BOUNDARIES)[..., None], other, dashes)
+    return dashes * sampler.uniform(0.9, 1.1, 1, 1)
+
+
+def _studs(sampler: BatchSampler, kind: Tensor) -> tuple[Tensor, Tensor]:
+    """Sample period and length of the groups of studs, (B, K) m each: dots, or single reflectors in paint."""
+    dots = kind == STUDS
+    reflectors = sampler.chance(0.35, 1) & sampler.chance(0.8, MAX_BOUNDARIES) & (kind != NONE)
+    is_long = sampler.uniform(0.0, 1.0)[:, None] < 0.85
+    period = torch.where(dots | reflectors, torch.where(is_long, 14.63, 7.32), 0.0)
+    return period, torch.where(dots, torch.where(is_long, 4.6, 7.4), 0.3)
+
+
 def dashes_of_lines(kind: Tensor, dashes: Tensor) -> Tensor:
     """Return (length, period) of the left and the right stripe of each boundary, (B, K, 2, 2) m.
 
@@ -188,11 +225,8 @@ def dashes_of_lines(kind: Tensor, dashes: Tensor) -> Tensor:
 
 def presence(layout: Layout, slot: Tensor, along: Tensor) -> Tensor:
     """Tell where boundary ``slot`` (B, N) is marked at arc lengths ``along`` (B, N), (B, N) in {0, 1}."""
-    period, length, phase, marked = (
-        t.gather(1, slot)
-        for t in (layout.missing_period, layout.missing_length, layout.missing_phase, layout.marked.float())
-    )
-    return marked * (((along + phase) % period) >= length)
+    period, length, phase = (values.gather(1, slot) for values in layout.gaps)
+    return layout.marked.float().gather(1, slot) * (((along + phase) % period) >= length)
 
 
 def labelled_slots(layout: Layout, ego_lane: Tensor) -> tuple[Tensor, Tensor]:

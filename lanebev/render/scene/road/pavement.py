@@ -85,6 +85,19 @@ def _tone(sampler: BatchSampler, concrete: Tensor, bright: Tensor) -> Tensor:
     return level[:, None] * tint
 
 
+def _edges(sampler: BatchSampler, median: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Sample the shoulders' widths (m), and the gutters' factors and widths (m), left and right, (B, 2)."""
+    narrow, full = sampler.chance(0.3, 2), sampler.chance(0.4, 2)  # full: about as wide as a lane
+    shoulder = torch.where(full, sampler.uniform(2.2, 3.7, 2), sampler.uniform(1.0, 4.0, 2))
+    shoulder = torch.where(narrow, sampler.uniform(0.2, 1.0, 2), shoulder)
+    shoulder[:, 0] = torch.where(median, sampler.uniform(1.5, 3.7), shoulder[:, 0])
+    gutter = sampler.either(0.7, (1.1, 2.2), (0.4, 0.9), 2)
+    gutter_width = sampler.sometimes(0.5, 0.05, 0.6, 2)
+    gutter[:, 0] = torch.where(median, sampler.uniform(1.2, 2.4), gutter[:, 0])
+    gutter_width[:, 0] = torch.where(median, sampler.uniform(0.05, 0.25), gutter_width[:, 0])
+    return shoulder, gutter, gutter_width
+
+
 def sample_pavement(
     sampler: BatchSampler, layout: Layout, dotted: Tensor, bright: Tensor, wet: Tensor, median: Tensor
 ) -> Pavement:
@@ -103,15 +116,7 @@ def sample_pavement(
     other = _tone(sampler, sampler.chance(0.4), bright & sampler.chance(0.5))
     same = sampler.chance(0.6)[:, None]
     tone = 1 + sampler.normal(0.06, MAX_BOUNDARIES + 1) * sampler.chance(0.6, 1)
-    width = layout.last_across()
-    narrow, full = sampler.chance(0.3, 2), sampler.chance(0.4, 2)  # full: about as wide as a lane
-    shoulder = torch.where(full, sampler.uniform(2.2, 3.7, 2), sampler.uniform(1.0, 4.0, 2))
-    shoulder = torch.where(narrow, sampler.uniform(0.2, 1.0, 2), shoulder)
-    shoulder[:, 0] = torch.where(median, sampler.uniform(1.5, 3.7), shoulder[:, 0])
-    gutter = sampler.either(0.7, (1.1, 2.2), (0.4, 0.9), 2)
-    gutter_width = sampler.sometimes(0.5, 0.05, 0.6, 2)
-    gutter[:, 0] = torch.where(median, sampler.uniform(1.2, 2.4), gutter[:, 0])
-    gutter_width[:, 0] = torch.where(median, sampler.uniform(0.05, 0.25), gutter_width[:, 0])
+    shoulder, gutter, gutter_width = _edges(sampler, median)
     old = sampler.uniform(0, 1)  # how old the road is
     even = torch.where(bright, sampler.chance(0.6), sampler.chance(0.3))
     rough = torch.where(even, sampler.uniform(0.0, 0.3), 1.0)
@@ -121,7 +126,7 @@ def sample_pavement(
     )
     return Pavement(
         left=-shoulder[:, 0],
-        right=width + shoulder[:, 1],
+        right=layout.last_across() + shoulder[:, 1],
         base=base,
         shoulder=torch.where(same, base * sampler.uniform(0.8, 1.1, 1), other),
         deck=_tone(sampler, ~concrete, bright),
