@@ -20,8 +20,9 @@ from lanebev.camera.parameters import (
     matrix_entries,
     size_of_images,
 )
-from lanebev.camera.parsing import mapping, number, once, stated_size
+from lanebev.camera.parsing import mapping, number, stated_size
 from lanebev.numbers import finite_numbers, shown
+from lanebev.plain_yaml import once
 
 _KITTI = re.compile(r"^[ \t]*P(?:_rect_)?\d+[ \t]*:", re.MULTILINE | re.ASCII)
 _KITTI_KEY = re.compile(r"\s*(P|S|[KD]_)")

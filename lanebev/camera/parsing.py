@@ -1,14 +1,11 @@
-"""Syntax of camera files: YAML, JSON and XML to keys and values; scalars stay unparsed texts.
-
-YAML 1.1 would make 416 of a width of 0640, and 750 of 12:30.
-"""
+"""Syntax of camera files: YAML, JSON and XML to keys and values; scalars stay unparsed texts."""
 
 import itertools
 import json
 import math
 import re
 import xml.etree.ElementTree as ET
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -16,6 +13,7 @@ import yaml
 
 from lanebev.camera.parameters import left_square, matrix_entries
 from lanebev.numbers import finite_numbers, shown
+from lanebev.plain_yaml import PlainLoader, once
 
 _LARGEST_YAML = 1_000_000  # characters; PyYAML reads some 100,000 a second
 _MOST_NUMBERS = 1_000  # numbers in one matrix
@@ -79,42 +77,19 @@ def is_ros_ini(text: str) -> bool:
     return _ROS_INI.search(text) is not None
 
 
-def once(pairs: Iterable[tuple[str, Any]]) -> dict[str, Any]:
-    """Return the pairs as a dict; a repeated key is an error."""
-    fields: dict[str, Any] = {}
-    for key, value in pairs:
-        if key in fields:
-            raise ValueError(f"expected each key once, got {shown(key)} twice")
-        fields[key] = value
-    return fields
+class _CameraLoader(PlainLoader):
+    """Loader that also knows OpenCV's matrices and Python's tuples."""
 
 
-class _TextLoader(yaml.SafeLoader):
-    """SafeLoader that leaves scalars as texts, knows OpenCV's matrices and refuses a key given twice."""
-
-    yaml_implicit_resolvers = {}  # noqa: RUF012 - so it is in the base class
-
-    def construct_mapping(self, node: yaml.Node, deep: bool = False) -> dict[Any, Any]:
-        if not isinstance(node, yaml.MappingNode):
-            raise ValueError(f"expected keys and values at line {node.start_mark.line + 1}, got none")
-        if not all(isinstance(key, yaml.ScalarNode) for key, _ in node.value):
-            raise ValueError("expected plain keys, got a list or a mapping as a key")
-        once((key.value, None) for key, _ in node.value)
-        return {key.value: self.construct_object(value, deep=deep) for key, value in node.value}
-
-
-_TextLoader.add_implicit_resolver(
-    "tag:yaml.org,2002:null", re.compile(r"^(?:~|null|Null|NULL|)$"), ["~", "n", "N", ""]
-)
 for _tag in ("opencv-matrix", "opencv-nd-matrix"):
-    _TextLoader.add_constructor(
-        f"tag:yaml.org,2002:{_tag}", partial(_TextLoader.construct_mapping, deep=True)
+    _CameraLoader.add_constructor(
+        f"tag:yaml.org,2002:{_tag}", partial(_CameraLoader.construct_mapping, deep=True)
     )
-_TextLoader.add_constructor(
-    "tag:yaml.org,2002:python/tuple", partial(_TextLoader.construct_sequence, deep=True)
+_CameraLoader.add_constructor(
+    "tag:yaml.org,2002:python/tuple", partial(_CameraLoader.construct_sequence, deep=True)
 )
 for _tag in ("int", "float", "bool", "timestamp"):
-    _TextLoader.add_constructor(f"tag:yaml.org,2002:{_tag}", partial(_TextLoader.construct_scalar))
+    _CameraLoader.add_constructor(f"tag:yaml.org,2002:{_tag}", partial(_CameraLoader.construct_scalar))
 
 
 def _parse_yaml(text: str) -> list[Any]:
@@ -126,7 +101,7 @@ def _parse_yaml(text: str) -> list[Any]:
         lines[0] = ""
     found: list[Any] = []
     try:
-        documents = yaml.load_all(_TABS.sub(" ", "\n".join(lines)), Loader=_TextLoader)
+        documents = yaml.load_all(_TABS.sub(" ", "\n".join(lines)), Loader=_CameraLoader)
         found.extend(itertools.islice((each for each in documents if each is not None), 2))
         return found or [None]  # ros2 topic echo ends with ---
     except (yaml.YAMLError, RecursionError, ValueError) as error:

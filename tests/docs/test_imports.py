@@ -13,7 +13,7 @@ LAYERS = (  # from the bottom: a package imports packages of lower layers only, 
     {"pipes", "signals", "torch_internals"},
     {"numbers", "tensors"},
     {"geometry.rotation"},  # angles to matrices, which Extrinsics offers as methods
-    {"types", "batch"},
+    {"types", "batch", "plain_yaml"},
     {"geometry"},
     {"camera"},
     {"observation"},

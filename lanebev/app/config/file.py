@@ -2,8 +2,7 @@
 
 import difflib
 import re
-from collections import Counter
-from collections.abc import Callable, Hashable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import fields
 from pathlib import Path
 
@@ -12,44 +11,32 @@ import yaml
 from lanebev.app.config.options import parsed
 from lanebev.app.config.run import RunConfig
 from lanebev.numbers import read_text
+from lanebev.plain_yaml import PlainLoader
 
 _FLAGS = {"true": True, "yes": True, "on": True, "false": False, "no": False, "off": False}
 
 
-class _PlainLoader(yaml.SafeLoader):
-    """SafeLoader that leaves numbers and dates as texts, and refuses a key given twice."""
-
-    yaml_implicit_resolvers = {}  # noqa: RUF012 - so it is in the base class
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, object]:
-        keys = Counter(key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode))
-        if twice := [key for key, count in keys.items() if count > 1]:
-            raise ValueError(f"the key {twice[0]!r} twice")
-        return super().construct_mapping(node, deep=deep)
+class _SettingsLoader(PlainLoader):
+    """Loader that also knows true and false, and merge keys."""
 
 
 for _tag, _pattern, _begin in (
-    ("null", "~|null|Null|NULL|", ["~", "n", "N", ""]),
     ("bool", "true|True|TRUE|false|False|FALSE", list("tTfF")),
     ("merge", "<<", ["<"]),
 ):
-    _PlainLoader.add_implicit_resolver(f"tag:yaml.org,2002:{_tag}", re.compile(f"^(?:{_pattern})$"), _begin)
+    _SettingsLoader.add_implicit_resolver(
+        f"tag:yaml.org,2002:{_tag}", re.compile(f"^(?:{_pattern})$"), _begin
+    )
 
 
 def load_plain_yaml(text: str) -> object:
     """Load YAML, with null, true and false, and all other plain values as texts.
 
-    YAML 1.1 would make 15 of a camera 017, 510 of a drive 8:30, and false of a road called No.
-
     Raises:
         yaml.YAMLError: the text is none.
-        ValueError: a key is given twice.
+        ValueError: a key is given twice, or is none.
     """
-    loader = _PlainLoader(text)
-    try:
-        loaded: object = loader.get_single_data()
-    finally:
-        loader.dispose()
+    loaded: object = yaml.load(text, Loader=_SettingsLoader)
     return loaded
 
 

@@ -167,11 +167,22 @@ def _doubt_of_camera(frames: Sequence[FrameLines], image_size: tuple[int, int]) 
 
 def _doubt_of_points(frames: Sequence[FrameLines], image_size: tuple[int, int]) -> SizeDoubt | None:
     """Return a doubt if points in pixels lie outside the images, or leave a large part of them empty."""
-    height, width = image_size
     points = _all_points([frame for frame in frames if frame.principal_point is None])
     if not len(points):
         return None
-    x, y = points.T
+    column, horizon = meeting_point(frames)
+    return (
+        _doubt_of_bounds(points, column, image_size)
+        or _doubt_of_horizon(points, horizon, image_size[0])
+        or _doubt_of_empty_part(points, column, horizon, image_size)
+    )
+
+
+def _doubt_of_bounds(
+    points: NDArray[np.float64], column: float, image_size: tuple[int, int]
+) -> SizeDoubt | None:
+    """Return a doubt if points (P, 2) lie outside the images, or all within a pixel."""
+    (height, width), (x, y) = image_size, points.T
     outside = (y >= height) | (x < -_BESIDE * width) | (x > (1 + _BESIDE) * width)
     if outside.mean() > _OUTSIDE:
         return SizeDoubt(
@@ -180,7 +191,6 @@ def _doubt_of_points(frames: Sequence[FrameLines], image_size: tuple[int, int]) 
             _STATE_SIZE,
             is_outside=True,
         )
-    column, horizon = meeting_point(frames)
     right = x.min() >= 0 and column > _MEET_RIGHT * width
     if right and (beyond := (x > width).mean()) > _BEYOND:
         return SizeDoubt(
@@ -194,6 +204,12 @@ def _doubt_of_points(frames: Sequence[FrameLines], image_size: tuple[int, int]) 
             f"{what} of all points lie between 0 and 1; are they shares of the sides instead of pixels?",
             "multiply them by the sides",
         )
+    return None
+
+
+def _doubt_of_horizon(points: NDArray[np.float64], horizon: float, height: int) -> SizeDoubt | None:
+    """Return a doubt if all or many points lie above the row where lines meet."""
+    y = points[:, 1]
     if horizon > y.max():
         return SizeDoubt(
             f"they meet at row {horizon:.0f}, below all of their points; are rows counted from below, or in "
@@ -206,6 +222,14 @@ def _doubt_of_points(frames: Sequence[FrameLines], image_size: tuple[int, int]) 
             "lines drawn on beyond the road?",
             "leave out what is above it",
         )
+    return None
+
+
+def _doubt_of_empty_part(
+    points: NDArray[np.float64], column: float, horizon: float, image_size: tuple[int, int]
+) -> SizeDoubt | None:
+    """Return a doubt if points leave a part of the images empty that lanes reach."""
+    (height, width), (x, y) = image_size, points.T
     centre = float(np.nanmean([column, 0.5 * (x.min() + x.max())]))  # at the left of larger images
     low = y.max() < _REACHED * height and x.max() < _REACHED * width and centre < _LEFT * width
     flat = y.max() < _REACHED_DOWN * height and not horizon >= _HIGH_HORIZON * height

@@ -127,7 +127,7 @@ def test_settings_are_checked_when_they_are_made(settings, message):
         ("every: 1.5", "every: expected a whole number, got '1.5'"),
         (
             "lane_width: 3.5\nlane_width: 3.6",
-            "expected a YAML file .*, got: the key 'lane_width' twice",
+            "expected a YAML file .*, got: expected each key once, got 'lane_width' twice",
         ),
         ("lane_width: 3.5\nlane-width: 3.6", "lane-width: expected it once, got it with - and with _"),
         ("stills: 1", "stills: expected true or false, got '1'"),

@@ -135,7 +135,7 @@ def test_a_path_that_leaves_the_folder_is_refused(write, tmp_path, key, text):
         ({"drive": []}, "expected drives and defaults, got 'drive'"),
         ("video", "expected a list of drives"),
         ("a: [", "not YAML"),
-        ("- {video: a.mp4, camera: c, video: b.mp4}", "the key 'video' twice"),
+        ("- {video: a.mp4, camera: c, video: b.mp4}", "expected each key once, got 'video' twice"),
     ],
 )
 def test_a_bad_manifest_is_one_line(write, rows, words):
