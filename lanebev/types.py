@@ -154,15 +154,16 @@ class Extrinsics(NamedTuple):
 
         Raises:
             TypeError: not numbers.
-            ValueError: angles of 90 degrees or more, such as numbers in degrees, or numbers not finite.
+            ValueError: angles of 90 degrees or more, such as numbers in degrees, a height not above 0, or
+                numbers not finite.
         """
         for name, angle in (("pitch", pitch), ("yaw", yaw), ("roll", roll)):
             check_number(name, angle)
             if not abs(angle) < math.pi / 2:
                 raise ValueError(f"{name}: expected rad within ±pi/2, got {angle:g}; see math.radians")
         check_number("height", height)
-        if not math.isfinite(height):
-            raise ValueError(f"height: expected finite m, got {height:g}")
+        if not 0 < height < math.inf:
+            raise ValueError(f"height: expected m above the road, finite and above 0, got {height:g}")
         return cls(*(torch.full((1,), value, dtype=dtype) for value in (pitch, yaw, roll, height)))
 
     def stack(self) -> Tensor:

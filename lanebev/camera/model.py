@@ -10,11 +10,13 @@ from numbers import Integral
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import ArrayLike
 from torch import Tensor
 
 from lanebev.camera.files import camera_from_fields, read_camera, write_camera
-from lanebev.camera.parameters import CameraParameters
+from lanebev.camera.parameters import CameraParameters, are_swapped
 from lanebev.geometry.distortion import check_lens, lens_model, max_undistorted_radius
 from lanebev.geometry.lens import (
     check_intrinsics,
@@ -36,6 +38,13 @@ def check_camera(value: object) -> None:
     if not isinstance(value, Camera):
         got = type(value).__qualname__
         raise TypeError(f"camera: expected a lanebev.Camera, got {got}; see Camera.from_file and from_fov")
+
+
+def _check_rows(points: Tensor) -> None:
+    """Raise unless these are the (N, 2) points of one camera."""
+    check_points(points)
+    if points.ndim != 2:
+        raise ValueError(f"points: expected (N, 2), got {tuple(points.shape)}; see Tensor.flatten(0, -2)")
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +101,7 @@ class Camera:
         cy: float,
         width: int,
         height: int,
-        distortion: tuple[float, ...] | list[float] = (),
+        distortion: ArrayLike | Tensor | None = None,
         model: str = "pinhole",
         dtype: torch.dtype = torch.float64,
     ) -> Camera:
@@ -105,7 +114,8 @@ class Camera:
             cy: y of the principal point, px.
             width: of the images, px.
             height: of the images, px.
-            distortion: coefficients in OpenCV's order; empty for none.
+            distortion: coefficients in OpenCV's order, also (1, D) or (D, 1) as OpenCV returns them; None or
+                empty for none.
             model: "pinhole", "fisheye" or "omni".
             dtype: dtype of the tensors.
 
@@ -120,7 +130,9 @@ class Camera:
                 check_number(name, value, "px as a number")
         rows, device = [[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]], device_of_numbers()
         intrinsics = torch.tensor(rows, dtype=dtype, device=device)
-        coefficients = torch.tensor(list(distortion), dtype=dtype, device=device)
+        coefficients = torch.tensor(
+            np.ravel(() if distortion is None else distortion), dtype=dtype, device=device
+        )
         return cls(intrinsics, coefficients, model, (height, width))
 
     @classmethod
@@ -177,8 +189,13 @@ class Camera:
             rectified: whether the images were rectified: then P is the camera matrix, without distortion.
 
         Raises:
+            TypeError: the fields are no mapping from names to values.
             ValueError: an unknown field, or a missing or absurd value.
         """
+        given: object = fields
+        if not isinstance(given, Mapping):
+            got = type(given).__qualname__
+            raise TypeError(f"fields: expected a mapping from names to values, got {got}; see from_file")
         return cls._of(camera_from_fields(fields, rectified))
 
     @classmethod
@@ -227,6 +244,11 @@ class Camera:
         """Return the camera of the image resized to (height, width), with pixel centres at integers."""
         if not (isinstance(image_size, Sequence) and len(image_size) == 2):
             raise TypeError(f"image_size: expected (height, width) in px, got {image_size!r}")
+        if are_swapped((image_size[0], image_size[1]), self.image_size):
+            raise ValueError(
+                f"image_size: expected (height, width), got {tuple(image_size)} for a camera of "
+                f"{self.image_size}: are they swapped?"
+            )
         sy, sx = image_size[0] / self.image_size[0], image_size[1] / self.image_size[1]
         resize = self.intrinsics.new_tensor(
             [[sx, 0.0, 0.5 * (sx - 1)], [0.0, sy, 0.5 * (sy - 1)], [0.0, 0.0, 1.0]]
@@ -250,6 +272,7 @@ class Camera:
 
     def distort_points(self, points: Tensor) -> Tensor:
         """Convert undistorted pixels (N, 2) to pixels as taken (N, 2)."""
+        _check_rows(points)
         return distort_points(points[None], self.intrinsics[None], self.distortion[None], self.model)[0]
 
     @cached_property
@@ -259,6 +282,7 @@ class Camera:
 
     def undistort_points(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Convert pixels as taken (N, 2) to undistorted ones (N, 2), and tell where there is one, (N,)."""
+        _check_rows(points)
         lens = (self.intrinsics[None], self.distortion[None], self.model)
         undistorted, valid = invert_distortion(points[None], *lens, reach=self.max_radius[None])
         return undistorted[0], valid[0]

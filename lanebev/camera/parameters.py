@@ -12,6 +12,7 @@ _FOCAL_RANGE = (0.1, 20.0)  # times the longer image side: 160 deg fisheye to 3 
 OFF_CENTRE = 0.2
 """Shares of the sides, more than any data set's principal point is off the centre."""
 
+_SAME_SHAPE = 1.25  # factor between height over width of an image and of a map that covers it, padded
 _LONGEST_SIDE = 99_999  # px
 _LARGEST_XI = 100.0  # ξ of the unified model; 1 is a parabolic mirror, fisheyes have 1 to 4
 
@@ -32,6 +33,13 @@ class CameraParameters(NamedTuple):
     model: str
     image_size: tuple[int, int]
     remark: str = ""
+
+
+def are_swapped(size: tuple[int, int], like: tuple[int, int]) -> bool:
+    """Tell whether a size has the proportions of another one only if its sides are swapped."""
+    (height, width), (rows, columns) = size, like
+    stated, swapped = (rows * width) / (columns * height), (rows * height) / (columns * width)
+    return not 1 / _SAME_SHAPE < stated < _SAME_SHAPE and 1 / _SAME_SHAPE < swapped < _SAME_SHAPE
 
 
 def matrix_entries(fx: float, fy: float, cx: float, cy: float) -> list[float]:

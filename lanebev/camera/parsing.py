@@ -284,7 +284,7 @@ def _opencv_data(name: str, value: Mapping[str, Any], count: int | None) -> tupl
     as_list = {key: field.split() if isinstance(field, str) else field for key, field in value.items()}
     shape = as_list.get("sizes") or [entry for key in ("rows", "cols") for entry in _flat(as_list.get(key))]
     sizes = finite_numbers(f"{name}.rows and .cols", _sequence(name, shape))
-    data = _sequence(name, as_list.get("data") or [])
+    data = list(_entries(_sequence(name, as_list.get("data") or [])))
     if (math.prod(sizes), len(data)) == _OF_FORMER_ROS:
         count = len(data)
     return data, count or (round(min(math.prod(sizes), 1e6)) if sizes else len(data))
@@ -296,6 +296,9 @@ def _entries(rows: list[Any]) -> Iterator[Any]:
 
 
 def _flat(value: Any) -> list[Any]:
+    """Return the numbers of a row, or of a text with blanks between them, as of lists without commas."""
+    if isinstance(value, str):
+        return value.split()
     return value if isinstance(value, list) else [] if value is None else [value]
 
 

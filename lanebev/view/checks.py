@@ -7,11 +7,11 @@ import torch
 from torch import Tensor
 
 from lanebev.batch import readable
+from lanebev.camera.parameters import are_swapped
 from lanebev.geometry.lens import check_distortion, check_intrinsics, last_row_is_small
 from lanebev.tensors import constant
 from lanebev.types import Extrinsics, check_devices, check_extrinsics, check_tensor
 
-_SAME_SHAPE = 1.25  # factor between height over width of a map and of the image that it covers, padded
 _CORNERS = (0.3, 0.9)  # fractions of width and height below or beyond which a principal point is doubted
 _BESIDE = -1e6  # px, place of every point in the image of a camera that cannot be used
 
@@ -41,9 +41,8 @@ def check_covers(image: Tensor, size: tuple[int, int]) -> None:
     """Raise ValueError if a map (B, C, h, w) has the shape of an image of (W, H) px, not of (H, W) px."""
     if torch.compiler.is_compiling():
         return
-    (rows, columns), (height, width) = image.shape[-2:], size
-    stated, swapped = (rows * width) / (columns * height), (rows * height) / (columns * width)
-    if not 1 / _SAME_SHAPE < stated < _SAME_SHAPE and 1 / _SAME_SHAPE < swapped < _SAME_SHAPE:
+    rows, columns = image.shape[-2:]
+    if are_swapped(size, (rows, columns)):
         raise ValueError(
             f"image_size: expected (height, width), got {size} with a map of {rows} x {columns} cells: are "
             "they swapped?"

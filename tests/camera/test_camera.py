@@ -138,6 +138,32 @@ def test_scaled_camera_sees_the_resized_image(size):
     torch.testing.assert_close(cam.scaled(size).project(point)[0][0], expected)
 
 
+def test_arguments_of_a_cameras_functions_are_checked():
+    cam = camera([])
+    with pytest.raises(
+        ValueError, match=r"image_size: .* got \(640, 360\) for a camera of \(720, 1280\): are"
+    ):
+        cam.scaled((640, 360))
+    assert cam.scaled((512, 512)).image_size == (512, 512)
+    for function in (cam.rays, cam.distort_points, cam.undistort_points):
+        for shape in ((2,), (3, 4, 2)):
+            with pytest.raises(ValueError, match=r"points: expected \(.*N, 2\), got"):
+                function(torch.zeros(shape))
+    with pytest.raises(TypeError, match="fields: expected a mapping from names to values, got list"):
+        Camera.from_fields([1.0])
+
+
+@pytest.mark.parametrize("shape", [(5,), (1, 5), (5, 1)])
+def test_coefficients_as_opencv_returns_them(shape):
+    parameters = (650.0, 655.0, 650.0, 370.0, 1280, 720)
+    lens = np.array(BROWN[5]).reshape(shape)
+    for distortion in (lens, lens.tolist(), torch.from_numpy(lens)):
+        assert torch.equal(
+            Camera.from_parameters(*parameters, distortion).distortion, camera(BROWN[5]).distortion
+        )
+    assert Camera.from_parameters(*parameters, None).distortion.shape == (0,)
+
+
 def test_cropped_camera_shifts():
     cam, point = camera(BROWN[5]), torch.tensor([[0.1, 0.2, 2.0]], dtype=torch.float64)
     shift = cam.project(point)[0] - cam.cropped(100, 40, 300, 500).project(point)[0]

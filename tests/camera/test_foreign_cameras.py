@@ -826,7 +826,9 @@ def test_matrices_without_rows_and_other_names_of_coefficients(tmp_path, key):
     lens = [-0.3, 0.1, 0.001, 0.002, 0.05]
     entries = np.ravel(MATRIX).tolist()
     fields = {"cameraMatrix": {"data": entries}, "width": 800, "height": 480}
-    for value in (lens, [lens], {"data": lens}, str(lens), "-0.3, 0.1, 0.001, 0.002, 0.05"):
+    texts = str(lens), "-0.3, 0.1, 0.001, 0.002, 0.05"
+    without_commas = ["-0.3 0.1 0.001 0.002 0.05"]  # image_pipeline#533
+    for value in (lens, [lens], {"data": lens}, *texts, without_commas, {"data": without_commas}):
         camera = read(tmp_path / "c.json", {**fields, key: value})
         assert_is(camera, 633, 633, 408, 245, 800, 480, lens)
     with pytest.raises(ValueError, match="coefficients: expected finite numbers, got -0,3"):

@@ -439,7 +439,8 @@ def test_lanebev_cameras(model):
     [
         ((2.0, 0.0, 0.0, 1.5), ValueError, "pitch: expected rad within ±pi/2, got 2; see math.radians"),
         ((0.0, 0.0, math.nan, 1.5), ValueError, "roll: expected rad"),
-        ((0.0, 0.0, 0.0, math.inf), ValueError, "height: expected finite m, got inf"),
+        ((0.0, 0.0, 0.0, math.inf), ValueError, "height: expected m above the road, .*, got inf"),
+        ((0.0, 0.0, 0.0, -1.5), ValueError, "height: expected m above the road, .*, got -1.5"),
         (("0", 0.0, 0.0, 1.5), TypeError, "pitch: expected a number, got str"),
     ],
 )
