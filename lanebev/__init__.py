@@ -16,7 +16,7 @@ __version__ = "0.1.0"
 
 
 def _is_command() -> bool:
-    """Tell whether this process is the command line, which answers ``--help`` before torch is imported."""
+    """Return whether this process is the command line, which answers ``--help`` before torch is imported."""
     program = next(iter(getattr(sys, "argv", [])), "")  # an embedding program may have none
     return program == "-m" or Path(program).stem == "lanebev"
 

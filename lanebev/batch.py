@@ -33,7 +33,7 @@ def select_rows(rows: Tensor, yes: T, no: T) -> T:
 
 
 def may_skip(wanted: Tensor) -> bool:
-    """Tell whether a costly step, such as a search, can be left out because no row wants its result.
+    """Return whether a costly step, such as a search, can be left out because no row wants its result.
 
     Beside :func:`replace_rows` the one place where the maths asks the device. A compiled, exported or traced
     program, ``torch.vmap``, ``FakeTensorMode`` and the device meta cannot, and always search.
@@ -42,7 +42,7 @@ def may_skip(wanted: Tensor) -> bool:
 
 
 def readable(value: Tensor) -> bool:
-    """Tell whether a check may read a tensor's numbers: now, and without waiting for a device."""
+    """Return whether a check may read a tensor's numbers: now, and without waiting for a device."""
     return value.device.type == "cpu" and not _is_without_numbers(value)
 
 

@@ -27,7 +27,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         options = vars(parser().parse_args(arguments))
     except SystemExit:
-        _print("")  # what --help or the like has said
+        _print("")  # flush the text of --help or --version
         raise
     command = options.pop("command")
     if options.pop("verbose"):

@@ -17,7 +17,7 @@ _BYTE_ORDER_MARKS = {
     codecs.BOM_UTF16_LE: "utf-16",  # as PowerShell's > writes
     codecs.BOM_UTF16_BE: "utf-16",
 }
-_BEGINNING = 65_536  # bytes of a file that tell whether it is a text
+_BEGINNING = 65_536  # first bytes of a file, which decide whether it is a text
 _GZIP = b"\x1f\x8b"
 _STAND_INS = {  # what came in place of another file, by its first bytes
     b"version https://git-lfs.github.com/": "a pointer of Git LFS; fetch the file by git lfs pull",

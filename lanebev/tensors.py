@@ -91,7 +91,7 @@ def one_thread_if_small(batch: Tensor, most: int) -> AbstractContextManager[None
 
 
 def recorded() -> bool:
-    """Tell whether operations are recorded for other numbers, by a compiler, an exporter or a mode."""
+    """Return whether operations are recorded for other numbers, by a compiler, an exporter or a mode."""
     if torch.compiler.is_compiling() or handled_by_mode():
         return True
     return bool(torch.jit.is_tracing())  # type: ignore[attr-defined, no-untyped-call]

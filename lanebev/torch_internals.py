@@ -11,7 +11,7 @@ TupleClass = TypeVar("TupleClass", bound=type)
 
 
 def handled_by_mode() -> bool:
-    """Tell whether a context handles every operation itself, as ``FakeTensorMode`` and ``make_fx`` do.
+    """Return whether a context handles every operation itself, as ``FakeTensorMode`` and ``make_fx`` do.
 
     Tensors may then have no numbers of their own, or numbers that stand for all others.
     """
@@ -19,7 +19,7 @@ def handled_by_mode() -> bool:
 
 
 def is_batched_by_vmap(value: Tensor) -> bool:
-    """Tell whether ``torch.vmap`` wraps this tensor, which then has no numbers of its own."""
+    """Return whether ``torch.vmap`` wraps this tensor, which then has no numbers of its own."""
     functorch = torch._C._functorch
     while functorch.is_functorch_wrapped_tensor(value):
         if functorch.is_batchedtensor(value):
@@ -29,12 +29,12 @@ def is_batched_by_vmap(value: Tensor) -> bool:
 
 
 def is_in_transform() -> bool:
-    """Tell whether a transform of ``torch.func`` is active, such as ``vmap``, ``grad`` or ``jvp``."""
+    """Return whether a transform of ``torch.func`` is active, such as ``vmap``, ``grad`` or ``jvp``."""
     return torch._C._are_functorch_transforms_active()
 
 
 def is_in_forward_mode() -> bool:
-    """Tell whether derivatives are computed forwards, as by ``torch.func.jvp``."""
+    """Return whether derivatives are computed forwards, as by ``torch.func.jvp``."""
     return forward_ad._current_level >= 0
 
 

@@ -52,7 +52,7 @@ def chosen(readers: Readers, wanted: str | None, has_usual: bool) -> CameraParam
 
 
 def _differs(read: Callable[[], CameraParameters], camera: CameraParameters) -> bool:
-    """Tell whether a reader gives another camera, or one that is not known."""
+    """Return whether a reader gives another camera, or one that is not known."""
     try:
         return read() != camera
     except ValueError:
@@ -64,6 +64,6 @@ def _listed(readers: Readers) -> str:
     return ", ".join([*names[:_MOST_NAMES], *(["..."] if len(names) > _MOST_NAMES else [])])
 
 
-def telling_names(names: list[str]) -> list[str]:
-    """Return the names of a file's cameras, or their places if these do not tell them apart."""
+def unique_names(names: list[str]) -> list[str]:
+    """Return the names of a file's cameras, or their numbers if two have the same name."""
     return names if len(set(names)) == len(names) else [str(place) for place in range(len(names))]

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from lanebev.camera.approximation import fov_model, kannala_brandt_like, radial_camera
-from lanebev.camera.choice import Readers, telling_names
+from lanebev.camera.choice import Readers, unique_names
 from lanebev.camera.parameters import (
     OFF_CENTRE,
     CameraParameters,
@@ -150,7 +150,7 @@ def colmap_text(path: Path) -> str:
 def colmap_cameras(text: str) -> Readers:
     """Return readers of the cameras of COLMAP's ``cameras.txt``, by their numbers."""
     found = _COLMAP.findall(text)
-    names = telling_names([number for number, *_ in found])
+    names = unique_names([number for number, *_ in found])
     return {name: partial(_colmap, *values) for name, (_, *values) in zip(names, found, strict=True)}
 
 
@@ -174,7 +174,7 @@ def _colmap(name: str, width: str, height: str, values: str) -> CameraParameters
 
 
 def is_woodscape(record: Any) -> bool:
-    """Tell whether a content is that of WoodScape's calibration of a fisheye."""
+    """Return whether a content is that of WoodScape's calibration of a fisheye."""
     intrinsic = record.get("intrinsic") if isinstance(record, Mapping) else None
     return isinstance(intrinsic, Mapping) and intrinsic.get("model") == "radial_poly"
 

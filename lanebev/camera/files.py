@@ -68,7 +68,7 @@ _UNDISTORTED = "roi"  # of OpenCV's getOptimalNewCameraMatrix: what of an undist
 def read_camera(
     path: str | Path, image_size: tuple[int, int] | None = None, rectified: bool = False
 ) -> CameraParameters:
-    """Read a camera file of any of these kinds, told apart by what is in it.
+    """Read a camera file of any of these kinds, recognised by its content.
 
     - OpenCV's FileStorage (YAML, XML, JSON) by its calibration programs' keys (``M1`` and ``D1`` of two
       cameras), and ``mtx`` and ``dist`` of its Python tutorial, also in NumPy's ``.npz``;
@@ -182,7 +182,7 @@ def _is_camera(read: Callable[[], CameraParameters]) -> bool:
 def _camera(
     content: Any, image_size: tuple[int, int] | None, rectified: bool, name: str | None
 ) -> CameraParameters:
-    """Return the camera of a file's content, whose format its keys tell."""
+    """Return the camera of a file's content, whose format is recognised by its keys."""
     if isinstance(content, str):
         raise ValueError(f"expected keys with a colon and a space, such as fx: 1150, got {shown(content)}")
     if not isinstance(content, dict | list) or content == {}:
@@ -205,7 +205,7 @@ def _camera(
 
 
 def _reader_by_keys(fields: Mapping[str, Any]) -> Callable[[Mapping[str, Any]], CameraParameters] | None:
-    """Return the reader of the camera of a program that its keys tell; None for others."""
+    """Return the reader for the program whose keys a file has; None for other files."""
     if fields.keys() == _OF_OPEN3D:  # beside a lens or a size in other keys the matrix is another program's
         return open3d
     if "ppx" in map(str.lower, fields):

@@ -246,7 +246,7 @@ def _projection(fields: Mapping[str, Any]) -> list[float]:
 
 
 def _restates(fields: Mapping[str, Any]) -> bool:
-    """Tell whether P = [K | 0] and R = I, which state no rectification."""
+    """Return whether P = [K | 0] and R = I, which state no rectification."""
     try:
         rotation = numbers(fields, *_ROTATION_KEYS, count=9)
         return rotation == _IDENTITY and _projection(fields) == camera_matrix(fields, *MATRIX_KEYS)

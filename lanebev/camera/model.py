@@ -214,7 +214,7 @@ class Camera:
         return CameraParameters(matrix, distortion, self.model, self.image_size)
 
     def fingerprint(self) -> str:
-        """Return a text that tells this camera from others: model, image size, intrinsics, distortion.
+        """Return a text that is different for every camera: model, image size, intrinsics, distortion.
 
         It is the same on any device and in any floating dtype, and does not depend on how many zeros follow
         the distortion's last coefficient. State files keep it.

@@ -81,7 +81,7 @@ def check_lens_keys(fields: Mapping[str, Any], known: Collection[str]) -> None:
 
 
 def _has_number(value: Any) -> bool:
-    """Tell whether a value is, or contains, a number other than 0."""
+    """Return whether a value is, or contains, a number other than 0."""
     if isinstance(value, list | Mapping):
         return any(map(_has_number, value.values() if isinstance(value, Mapping) else value))
     try:

@@ -150,7 +150,7 @@ def _needed(distortion: list[float], model: str) -> list[float]:
 
 
 def _invertible(camera: CameraParameters) -> bool:
-    """Tell whether the distortion can be inverted at four points half-way to the corners."""
+    """Return whether the distortion can be inverted at four points half-way to the corners."""
     height, width = camera.image_size
     inner = torch.tensor([[0.25, 0.25], [0.75, 0.25], [0.25, 0.75], [0.75, 0.75]], dtype=torch.float64)
     points = (inner * inner.new_tensor([width, height]))[None]

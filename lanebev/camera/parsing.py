@@ -73,7 +73,7 @@ def parse_documents(text: str) -> list[Any]:
 
 
 def is_ros_ini(text: str) -> bool:
-    """Tell whether a text is ROS's INI."""
+    """Return whether a text is ROS's INI."""
     return _ROS_INI.search(text) is not None
 
 

@@ -8,7 +8,7 @@ from contextlib import suppress
 from functools import partial
 from typing import Any, NamedTuple
 
-from lanebev.camera.choice import Readers, telling_names
+from lanebev.camera.choice import Readers, unique_names
 from lanebev.camera.datasets import is_woodscape, woodscape
 from lanebev.camera.formats import DISTORTION_KEYS, stated_model, with_sides
 from lanebev.camera.named_lens import LENS_NAMES, check_lens_keys, stated_lens
@@ -68,7 +68,7 @@ def record_cameras(content: Any, image_size: tuple[int, int] | None, rectified: 
     if isinstance(content, list):
         records = [each for each in content if _layout(each)]
         names = [str(each.get("token") or each.get("name")) for each in records]
-        named = dict(zip(telling_names(names), records, strict=True))
+        named = dict(zip(unique_names(names), records, strict=True))
     elif is_woodscape(content):
         return {"": partial(woodscape, content)}
     elif _layout(content):
@@ -119,7 +119,7 @@ def _read(record: Record, image_size: tuple[int, int] | None, rectified: bool) -
 
 
 def _is_waymos(values: list[float]) -> bool:
-    """Tell whether nine numbers are Waymo's fx fy cx cy k1 k2 p1 p2 k3, and no camera matrix."""
+    """Return whether nine numbers are Waymo's fx fy cx cy k1 k2 p1 p2 k3, and no camera matrix."""
     return values[8] != 1.0 and values[1] > 0.5 * values[0] > 0.0
 
 

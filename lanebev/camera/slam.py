@@ -95,7 +95,7 @@ def _of_maplab(entry: Mapping[str, Any]) -> Mapping[str, Any]:
 
 
 def is_kalibr(fields: Mapping[str, Any]) -> bool:
-    """Tell whether the keys are those of Kalibr's camera chain, or of one camera as in EuRoC."""
+    """Return whether the keys are those of Kalibr's camera chain, or of one camera as in EuRoC."""
     lens = fields.get("intrinsics")
     is_row = isinstance(lens, str) or (
         isinstance(lens, list) and not any(isinstance(row, list) for row in lens)

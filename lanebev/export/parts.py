@@ -58,7 +58,7 @@ def make_part(name: str, model: LaneBEV, camera: Camera) -> Part:
 
 
 def _facts(model: LaneBEV, camera: Camera) -> dict[str, Any]:
-    """Return sizes and conventions that the shapes of tensors do not tell."""
+    """Return sizes and conventions that cannot be read off the shapes of tensors."""
     grid = model.warp.grid
     return {
         "image_size": list(camera.image_size),

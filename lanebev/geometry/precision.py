@@ -38,7 +38,7 @@ def full_precision(function: Callable[P, R]) -> Callable[P, R]:
 
 
 def _is_precise(tensors: list[Tensor]) -> bool:
-    """Tell whether there is nothing to raise: one dtype of full precision, and no autocast of it.
+    """Return whether there is nothing to raise: one dtype of full precision, and no autocast of it.
 
     Autocast leaves double precision as it is. A compiled or exported program may be called under autocast
     later, so single precision in it is never sure.
@@ -52,7 +52,7 @@ def _is_precise(tensors: list[Tensor]) -> bool:
 
 
 def autocast_is_on(device: torch.device) -> bool:
-    """Tell whether autocast is on for a device; some, such as meta, have none."""
+    """Return whether autocast is on for a device; some, such as meta, have none."""
     return torch.amp.is_autocast_available(device.type) and torch.is_autocast_enabled(device.type)
 
 

@@ -83,7 +83,7 @@ def depth_below(height: Tensor, curvature: Tensor, z: Tensor) -> Tensor:
 
 
 def in_sight(height: Tensor, curvature: Tensor, z: Tensor) -> Tensor:
-    """Tell whether the road at a distance z can be seen over a crest.
+    """Return whether the road at a distance z can be seen over a crest.
 
     Source: the line through the camera that touches h + κ Z²/2 does so at Z = √(2 h / κ). The limit is 0.8 of
     that, as in :func:`road_profile`: beyond it a pixel is many metres of road. Arguments as of

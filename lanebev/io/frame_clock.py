@@ -64,5 +64,5 @@ class FrameClock:
 
 
 def _are_odd(steps: Sequence[float]) -> bool:
-    """Tell whether all of some time steps (s) are shorter, or all longer, than those of a camera."""
+    """Return whether all of some time steps (s) are shorter, or all longer, than those of a camera."""
     return len(steps) == _LOOKED_AT and (max(steps) < _SHORT_DT or min(steps) > _LONG_DT)

@@ -136,7 +136,7 @@ def _rows(text: str) -> list[list[str]]:
 
 
 def _are_commas_decimal(table: list[str]) -> bool:
-    """Tell whether commas are within the numbers of a table, not between its columns.
+    """Return whether commas are within the numbers of a table, not between its columns.
 
     Raises:
         ValueError: it cannot be told.
@@ -157,12 +157,12 @@ def _are_commas_decimal(table: list[str]) -> bool:
 
 
 def _states_unit(text: str) -> bool:
-    """Tell whether a title or a comment says in which unit speeds are."""
+    """Return whether a title or a comment says in which unit speeds are."""
     return _names(text, _SPEED) and _unit(text, _SPEED_UNITS) != 1.0
 
 
 def _are_titles(cells: list[str], below: list[list[str]]) -> bool:
-    """Tell whether a comment above a table names its columns."""
+    """Return whether a comment above a table names its columns."""
     if not below or len(cells) != len(below[0]) or not all(map(_is_number, below[0])):
         return False
     has_time = len(cells) == 1 or any(_names(cell, _TIME) for cell in cells)
@@ -240,7 +240,7 @@ def _unit(title: str, units: Mapping[str, float]) -> float:
 
 
 def _names(title: str, names: Sequence[str]) -> bool:
-    """Tell whether a title has one of these words, and none of other quantities."""
+    """Return whether a title has one of these words, and none of other quantities."""
     words = _words(title)
     return not {*words}.isdisjoint(names) and _OF_OTHERS.isdisjoint(words)
 

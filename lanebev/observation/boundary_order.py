@@ -106,7 +106,7 @@ class _Straight(NamedTuple):
 
 
 def _has_length(points: NDArray[np.float64]) -> bool:
-    """Tell whether a line has points on different rows."""
+    """Return whether a line has points on different rows."""
     return len(points) > 1 and bool(np.ptp(points[:, 1]) > 0)
 
 
@@ -133,7 +133,7 @@ def _longest_of_doubles(
 
 
 def _bound_one_lane(from_left: float, from_right: float) -> bool:
-    """Tell whether the lines to both sides bound one lane, by the camera's distances in camera heights."""
+    """Return whether the lines to both sides bound one lane, by the camera's distances in camera heights."""
     width = from_left + from_right
     return width < _WIDEST and abs(from_left - from_right) < 2 * _CENTRED * width
 

@@ -16,7 +16,7 @@ from lanebev.observation.vertices import order_along, take
 _STEP = 32  # px, of which the sides of a network's input are multiples
 _EDGE = 4  # px of the network's input, at the edge of a far view, where lines have no vertices
 _DIFFERENT_LINES = 1.0  # camera heights (less than half a lane) from which both views show different lines
-_LEAST_BELOW = 10.0  # px below the horizon, where a camera height is too few px to tell
+_LEAST_BELOW = 10.0  # px below the horizon; nearer to it a camera height is too few px
 _LEAST_VERTICES = 4  # vertices of a boundary in the far view, below which those of the whole image are kept
 
 

@@ -135,7 +135,7 @@ def extract_segments(
 
 
 def _are_probabilities(logits: Tensor) -> bool:
-    """Tell whether maps (B, 1+L, h, w), where they can be read, are at least 0 and their sums 1."""
+    """Return whether maps (B, 1+L, h, w), where they can be read, are at least 0 and their sums 1."""
     if not readable(logits) or logits.numel() == 0 or bool(logits.detach().amin() < 0):
         return False
     return bool(((logits.detach().sum(1) - 1).abs() < _OFF_ONE).all())

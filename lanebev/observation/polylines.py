@@ -198,7 +198,7 @@ def _without_edges(line: LaneLine, width: int) -> LaneLine:
 
 
 def _repeats_end(points: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Tell which points (P, 2) have the x of a line's end on rows beyond it, as ``numpy.interp`` makes them.
+    """Return which points (P, 2) repeat the x of a line's end on rows beyond it, as from ``numpy.interp``.
 
     They are two or more of one x on evenly spaced rows, along which the line would move by more than a pixel
     if it went on as before; a curve becomes vertical by and by, and a line on a grid is so elsewhere too. Of
@@ -222,7 +222,7 @@ def _repeats_end(points: NDArray[np.float64]) -> NDArray[np.bool_]:
 
 
 def _moves_on(x: NDArray[np.float64], same: int) -> bool:
-    """Tell whether whole numbers would move by 10 px along their first steps, as they do behind these.
+    """Return whether whole numbers would move by 10 px along their first steps, as they do behind these.
 
     A curve that becomes vertical there would move by 2 to 8 px, one that is so for longer moves ever faster.
 

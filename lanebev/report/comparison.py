@@ -55,7 +55,7 @@ class AxisDifference:
 def common_frames(first: RunFolder, second: RunFolder) -> list[Pair]:
     """Return the rows of the same frames: of images by name, else by number in the source.
 
-    The name is the end of the path, as long as it must be to tell the frames of each run apart.
+    The name is the end of the path, as long as needed to be unique among the frames of each run.
     """
     keys: tuple[Sequence[object], Sequence[object]] | None = _names(first.rows, second.rows)
     if keys is None:
@@ -164,7 +164,7 @@ def comparison_summary(first: RunFolder, second: RunFolder) -> str:
 def _names(
     first: Sequence[ExtrinsicsRow], second: Sequence[ExtrinsicsRow]
 ) -> tuple[list[tuple[str, ...]], list[tuple[str, ...]]] | None:
-    """Return the names of the images of both runs; None where they do not tell the frames apart."""
+    """Return the names of the images of both runs; None where two frames have the same name."""
     parts = [[PurePath(row.image).parts for row in rows] for rows in (first, second)]
     if not all(each for names in parts for each in names):
         return None

@@ -13,7 +13,7 @@ from bokeh.resources import Resources
 from numpy.typing import NDArray
 
 GRID, INK = "#e5e9ef", "#57606a"
-LEAST_RANGE = (0.5, 0.5, 0.5, 0.1)  # deg, deg, deg, m: no zoom into nothing
+LEAST_RANGE = (0.5, 0.5, 0.5, 0.1)  # deg, deg, deg, m: smallest range of an axis in a plot
 _NOW = "now"  # name of the lines that mark the frame shown
 _TOOLS = "xpan,xbox_zoom,xwheel_zoom,reset,save"
 _FONT = "system-ui, sans-serif"

@@ -23,7 +23,7 @@ from lanebev.view.grid import BEVGrid
 BOUNDARY_COLOURS = (
     (186, 140, 255), (80, 170, 255), (0, 214, 160), (255, 190, 0), (255, 112, 96), (255, 150, 214),
 )  # fmt: skip
-"""RGB of boundaries 0..5, told apart also without red and green, on asphalt and on paper."""
+"""RGB of boundaries 0..5, distinguishable also without red and green, on asphalt and on paper."""
 
 PANEL_HEIGHT = 720
 _WIDEST = 4  # times its height, of a picture that fills it

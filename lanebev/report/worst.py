@@ -16,7 +16,7 @@ _APART = 0.3  # s, least time between two listed moments
 
 
 class Moment(NamedTuple):
-    """A frame worth looking at.
+    """A frame to look at, with the reason.
 
     Attributes:
         place: index of its row.

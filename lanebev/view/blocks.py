@@ -74,7 +74,7 @@ def blocks(cells: Cells, lens: Lens | None, limit: float, memory: Memory | None 
 
 
 def _may_choose(cells: CellSums) -> bool:
-    """Tell whether what is computed may depend on values, and interpolation is as exact as the numbers."""
+    """Return whether what is computed may depend on values, and interpolation is as exact as the numbers."""
     by_row = cells.by_row
     return by_row.dtype == torch.float32 and by_row.device.type == "cpu" and not traced()
 
@@ -127,5 +127,5 @@ def _spans(rows: tuple[int, int], step: int) -> Iterator[tuple[int, int]]:
 
 
 def traced() -> bool:
-    """Tell whether operations are recorded for all possible values."""
+    """Return whether operations are recorded for all possible values."""
     return recorded() or is_in_transform()

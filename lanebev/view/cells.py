@@ -90,7 +90,7 @@ def cell_sums(
 def rows_in_sight(
     grid: BEVGrid, plane_heights: Sequence[float], extrinsics: Extrinsics, vertical_curvature: Tensor
 ) -> Tensor:
-    """Tell which rows of cells, (B, P·U), no crest hides; arguments as of :func:`cell_sums`."""
+    """Return which rows of cells, (B, P·U), no crest hides; arguments as of :func:`cell_sums`."""
     _, z = _axes(grid, vertical_curvature.dtype, vertical_curvature.device)
     below = extrinsics.height.unsqueeze(-1) - constant(tuple(plane_heights), like=vertical_curvature)
     return in_sight(below.unsqueeze(-1), vertical_curvature[:, None, None], z).flatten(1)

@@ -111,7 +111,7 @@ def _maps_written(
 
 
 def _may_overwrite() -> bool:
-    """Tell whether results need no graph, be it of gradients or of operations."""
+    """Return whether results need no graph, be it of gradients or of operations."""
     return not (torch.is_grad_enabled() or traced())
 
 
@@ -173,7 +173,7 @@ def map_coordinate(
 
 
 def _is_for_opencv(features: Tensor, at: Tensor) -> bool:
-    """Tell whether OpenCV samples as :func:`_grid_sample` does: without gradients, on the CPU."""
+    """Return whether OpenCV samples as :func:`_grid_sample` does: without gradients, on the CPU."""
     return (
         _may_overwrite()
         and (at.device.type, at.dtype) == ("cpu", torch.float32)

@@ -30,7 +30,7 @@ _LEAST_ROWS = 3 * _NODES  # a tile has at least so many
 _GROWTH = 0.5  # share of its least depth that the depth grows by within a tile
 _COLUMNS = 128  # a tile has so many; with a lens half
 _TOLERANCE = 4e-6  # error, in half images: 0.004 px of 1920; float32 rounds by a quarter of it
-_LOW = _NODES - 2  # the coefficients of this degree and higher tell what those of higher ones would add
+_LOW = _NODES - 2  # the coefficients from this degree on estimate the error of leaving out higher ones
 _SUMS = np.stack([np.ones(_NODES), np.arange(_NODES) >= _LOW], axis=1).astype(np.float32)
 LARGEST_WEIGHTS = 4.0  # the magnitudes of the weights of a cell sum up to less
 _OUTSIDE = 0.25  # share of the distance to the image by which a tile that is not in it may be off

@@ -62,7 +62,7 @@ def read_metadata(path: str | Path | None = None) -> dict[str, Any]:
 
 
 def is_checkpoint(path: Path) -> bool:
-    """Tell whether a file is a checkpoint of training, by its ending or by what torch.save begins with."""
+    """Return whether a file is a checkpoint of training, by its ending or by what torch.save begins with."""
     if path.suffix == ".ckpt":
         return True
     if not path.is_file():

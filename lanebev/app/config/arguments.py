@@ -41,7 +41,7 @@ Open report.html in the output folder first.
 """
 
 
-_LONGEST = 300  # characters of an error, in which a glob without quotes has all its files
+_LONGEST = 300  # characters of an error that are printed: a glob without quotes can make it very long
 
 
 class _Parser(argparse.ArgumentParser):

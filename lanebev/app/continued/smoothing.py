@@ -23,7 +23,7 @@ from lanebev.io.lanes.tusimple import tusimple_line
 from lanebev.io.output.folder import OutputFolder
 from lanebev.types import Calibration, Extrinsics
 
-_NO_LANES = (np.empty(0), np.empty((0, 0)))  # rows, and columns of curves: what was seen is enough
+_NO_LANES = (np.empty(0), np.empty((0, 0)))  # no fitted curves: the second pass reads the vertices only
 
 
 class SmoothedPoses(NamedTuple):

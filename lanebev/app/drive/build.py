@@ -175,7 +175,7 @@ def make_observer(
 
 
 def input_files(config: RunConfig, source: FrameSource) -> list[str | Path]:
-    """Return the files that a run reads and does not mean to replace."""
+    """Return the files that a run reads and must not replace."""
     lanes = [] if config.lanes is None else lane_files(config.lanes)
     weights = [] if config.weights is None else [config.weights]
     files: list[str | Path] = [camera_file(config.camera)] if config.camera else []

@@ -35,7 +35,7 @@ from lanebev.tensors import map_tensors
 RunTracker = Tracker[JointState] | Tracker[TwoStageState]
 
 _MOST_WORKERS = 4  # each holds a frame's feature maps in memory
-_HIGHEST = 4  # times its width, an image: the network resizes it to a fixed width, and would need many GB
+_HIGHEST = 4  # largest height of an image over its width; with a larger one the network would need many GB
 _WORKERS_SHARED = 2  # one frame of a drive is in the batch under way, another waits for the next
 
 
@@ -183,7 +183,7 @@ class NetworkObserver:
         self._shared = network if isinstance(network, SharedNetwork) else None
         self.model = network.model if isinstance(network, SharedNetwork) else network.eval()
         self.camera = camera
-        self.device = next(self.model.parameters(), torch.zeros(0)).device  # ONNX has no parameters
+        self.device = next(self.model.parameters(), torch.zeros(0)).device  # an ONNX file has no parameters
         self.workers = min(torch.get_num_threads(), _MOST_WORKERS) if self.device.type == "cpu" else 1
         if self._shared is not None and self._shared.most > 1:
             self.workers = _WORKERS_SHARED

@@ -13,7 +13,7 @@ from lanebev.io.frame_source import FrameSource
 from lanebev.io.frames import Frame
 from lanebev.types import Status
 
-_LOOKED_AT = 8  # frames; fewer tell nothing
+_LOOKED_AT = 8  # frames that are compared, at least
 _WITHIN = 120.0  # s of the source, from which these are taken
 _SHARE = 0.5  # fraction of frames in which lanes must determine a pose
 

@@ -38,7 +38,7 @@ class Part(NamedTuple):
 
 
 def parts_of(start: float, end: float, length: float) -> list[Part]:
-    """Return parts of about ``length`` s from ``start`` to ``end``, one where the next begins.
+    """Return parts of about ``length`` s from ``start`` to ``end``; each ends where the next one begins.
 
     A rest of less than half a part belongs to the last one.
     """
@@ -161,7 +161,7 @@ def _sizes_and_times(path: str) -> list[object]:
 
 
 def earlier_outcome(task: Task) -> Outcome | None:
-    """Return what became of a task in an earlier call; None if it is to be done, or done again."""
+    """Return the outcome of a task in an earlier call; None if there is none, or its input has changed."""
     failed = _read_mark(failure_path(task), task)
     if failed is not None:
         return failed
@@ -170,13 +170,13 @@ def earlier_outcome(task: Task) -> Outcome | None:
 
 
 def is_done(task: Task) -> bool:
-    """Return whether a task was finished, and well, in an earlier call or by a worker that died later on."""
+    """Return whether a task finished without failure, in an earlier call or in a worker that died later."""
     earlier = earlier_outcome(task)
     return earlier is not None and not earlier.failure
 
 
 def write_mark(task: Task, outcome: Outcome) -> None:
-    """Note what became of a task, for the next call.
+    """Write the outcome of a task to a file, for the next call.
 
     Raises:
         OSError: the disk is full.

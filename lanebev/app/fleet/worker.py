@@ -30,7 +30,7 @@ def run_tasks(tasks: Sequence[Task]) -> list[Outcome]:
     """
     try:
         network = _shared_network(tasks[0].config, len(tasks))
-    except Exception as error:  # as of a drive
+    except Exception as error:  # reported as the failure of every drive
         return [_failed(task, error) for task in tasks]
     if len(tasks) == 1:  # in the main thread, which signals reach
         return [_run_task(tasks[0], network)]
@@ -51,7 +51,7 @@ def _run_task(task: Task, network: SharedNetwork | None) -> Outcome:
         before = sum(part.seconds for part in map(earlier_outcome, task.parts) if part is not None)
         outcome = Outcome(task.name, frames=frames, seconds=before + time.perf_counter() - start)
         write_mark(task, outcome)
-    except Exception as error:  # whatever it is, it is this drive's only
+    except Exception as error:  # a failure of any kind must not stop the other drives
         return _failed(task, error)
     for part in task.parts:
         shutil.rmtree(part.config.out, ignore_errors=True)

@@ -63,7 +63,7 @@ class ViewChanges:
         """
         is_next, self._dt = dt < _LONGER * self._dt, dt
         if image is None:
-            self._dt = 0.0  # the next one is not the next of the last that was seen
+            self._dt = 0.0  # frames are missing before the next one
             return
         seen = image[::_STRIDE, ::_STRIDE].astype(np.float32)
         if self._before:

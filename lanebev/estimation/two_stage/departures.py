@@ -153,7 +153,7 @@ def shape_moment(information: Tensor) -> Tensor:
 
 
 def boundary_moments(matrix: Tensor, vector: Tensor, num_shared: int, num_boundaries: int) -> Tensor:
-    """Compute what a frame tells of the size of the boundaries' own departures, beside what all share.
+    """Compute a frame's moments of the departures of each boundary, without those common to all.
 
     Source: Eq. (T6), random effects in a regression and moments for their variance (DerSimonian and Laird
     1986), with Satterthwaite's degrees of freedom.

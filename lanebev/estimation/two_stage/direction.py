@@ -147,7 +147,7 @@ def predict_direction(state: TwoStageState, dt: Tensor, cfg: TwoStageConfig) -> 
 
 
 def is_supported(segments: LaneSegments, inliers: Tensor, cfg: TwoStageConfig) -> Tensor:
-    """Tell which rows have enough segments that agree, on two boundaries at least, (B,) bool."""
+    """Return which rows have enough segments that agree, on two boundaries at least, (B,) bool."""
     weight = segments.weight * inliers
     every = torch.arange(cfg.num_boundaries, device=weight.device)
     member = (segments.boundary.unsqueeze(-1) == every).to(weight.dtype)

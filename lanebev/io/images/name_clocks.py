@@ -75,7 +75,7 @@ def read_clocks(paths: tuple[str, ...]) -> NameClocks | None:
 
 
 def are_decimal(fractions: Sequence[str]) -> bool:
-    """Tell whether digits after a dot are fractions: of one length, or as in a float's shortest text."""
+    """Return whether digits after a dot are fractions: of one length, or as in a float's shortest text."""
     lengths = {len(digits) for digits in fractions}
     if len(lengths) <= 1:
         return True
@@ -167,7 +167,7 @@ def _unevenness(times: Sequence[Fraction]) -> float:
 
 
 def _may_be_numbers(matches: Sequence[re.Match[str]]) -> bool:
-    """Tell whether digits after a date may be numbers of images.
+    """Return whether digits after a date may be numbers of images.
 
     They may if they are 6 that begin with 00, or 9 with 0000; also 6 of one minute from its first second on,
     such as 100000 to 100020.
@@ -189,14 +189,14 @@ def _may_be_numbers(matches: Sequence[re.Match[str]]) -> bool:
 
 
 def _begin_again(times: Sequence[Fraction]) -> bool:
-    """Tell whether digits after the seconds begin again in each before they fill it, as numbers do."""
+    """Return whether digits after the seconds begin again in each before they fill it, as numbers do."""
     seconds = {int(time) for time in times}
     rate = len(times) / len(seconds)
     return len(seconds) > 2 and max(time % 1 for time in times) < 1 - 2 / rate
 
 
 def _are_counts(times: Sequence[Fraction]) -> bool:
-    """Tell whether digits after the seconds are numbers, as of images or cameras.
+    """Return whether digits after the seconds are numbers, as of images or cameras.
 
     Those of a clock differ, fall from a second to the next, and do not rise by less than 4 ms.
     """

@@ -79,13 +79,13 @@ def in_natural_order(paths: Iterable[str]) -> list[str]:
 
 
 def _are_hexadecimal(paths: Sequence[str]) -> bool:
-    """Tell whether images' names are numbers of one length to the base 10 or 16."""
+    """Return whether images' names are numbers of one length to the base 10 or 16."""
     stems = [splitext(basename(path))[0] for path in paths]
     return len({len(stem) for stem in stems}) == 1 and all(map(_DIGITS.fullmatch, stems))
 
 
 def _are_decimal(paths: Sequence[str]) -> bool:
-    """Tell whether numbers with a dot at the end of names are decimal; also if there are none."""
+    """Return whether numbers with a dot at the end of names are decimal; also if there are none."""
     return are_decimal([match[2] for match in map(_DECIMAL.search, paths) if match])
 
 
@@ -152,12 +152,12 @@ def times_of_stamps(stamps: Sequence[str]) -> Sequence[Fraction]:
 
 
 def _are_plausible(times: Sequence[Fraction]) -> bool:
-    """Tell whether all times (s since 1970) are from 1980 to 2040, as those of drives are."""
+    """Return whether all times (s since 1970) are from 1980 to 2040, as those of drives are."""
     return all(_EPOCH[0] <= time < _EPOCH[1] for time in times)
 
 
 def are_of_a_drive(times: Sequence[Fraction]) -> bool:
-    """Tell whether times (s) are of several frames and rise as those of a drive."""
+    """Return whether times (s) are of several frames and rise as those of a drive."""
     steps = [b - a for a, b in pairwise(times)]
     return bool(steps) and _STEPS[0] <= min(steps) <= max(steps) <= _STEPS[1] and median_low(steps) >= FASTEST
 

@@ -37,13 +37,13 @@ _READERS: dict[str, Callable[[Path], list[FrameLines]]] = {  # by a key that no 
 }
 _OF_TUSIMPLE = {"lanes", "h_samples", "raw_file"}
 _BEGIN = 1_000  # characters
-_FIRST = 100  # objects that tell the format
+_FIRST = 100  # objects whose keys decide the format
 _MOST_ENDINGS = 5  # in a message
 _OF_LLAMAS = re.compile(r"_(color|gray)_rect$")  # ends the names of LLAMAS' images, not of its labels
 
 
 def read_lanes(path: str | Path, intrinsics: NDArray[np.float64] | None = None) -> list[FrameLines]:
-    """Read a lane file of any of the formats, which its keys tell, or a folder of such files.
+    """Read a lane file, whose format is recognised by its keys, or a folder of such files.
 
     Args:
         path: path of the file or folder.

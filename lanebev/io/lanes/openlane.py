@@ -104,13 +104,13 @@ def image_from_camera_points(points: Array, intrinsics: Array) -> Array:
 
 
 def _is_list_of_points(lane: Any) -> bool:
-    """Tell whether a line's ``xyz`` is P lists of three numbers, not three lists of P; 3 do not tell."""
+    """Return whether a line's ``xyz`` is P lists of three numbers, not three lists of P; 3 do not tell."""
     xyz = lane.get("xyz") if isinstance(lane, dict) else None
     return isinstance(xyz, list) and len(xyz) not in (0, 3) and _are_threes(xyz)
 
 
 def _is_3d(lane: dict[str, Any]) -> bool:
-    """Tell whether a line has 3D points only."""
+    """Return whether a line has 3D points only."""
     return lane.get("uv") is None and lane.get("xyz") is not None
 
 

@@ -159,12 +159,12 @@ def columns(name: str, values: list[Any], count: int) -> NDArray[np.float64]:
 
 
 def may_bound_lane(*labels: Any) -> bool:
-    """Tell whether a line with these labels may bound a lane; kerbs and what crosses the road do not."""
+    """Return whether a line with these labels may bound a lane; kerbs and what crosses the road do not."""
     return not any(_NO_BOUNDARY.search(each) for each in labels if isinstance(each, str))
 
 
 def is_probable(name: str, probability: Any) -> bool:
-    """Tell whether a detector gives a line a probability of at least one half, or none at all.
+    """Return whether a detector gives a line a probability of at least one half, or none at all.
 
     The benchmarks' predictions contain lines of any probability, for curves of precision and recall.
 

@@ -72,7 +72,7 @@ def open_video(source: str) -> av.container.InputContainer:
 
 
 def tell_damage(decoder: av.VideoCodecContext | None) -> None:
-    """Let a decoder tell damaged images; None, of an unknown codec, tells nothing."""
+    """Let a decoder report damaged images; None is an unknown codec, which reports none."""
     if decoder is None:
         return
     if decoder.name in _STRICT:

@@ -18,7 +18,7 @@ from lanebev.io.video.decoding import moving_pictures
 
 LONGEST_STEP = 60  # s between two frames of a drive
 _MOST_MISSING = 0.2  # of the frames; with more of them, times are those of a camera that varies
-_HEAD = 8  # bytes, which tell what kind of file it is
+_HEAD = 8  # first bytes, by which the kind of a file is recognised
 _HEAD_AGAIN = ("mpegts", "mxf", "mpjpeg")  # formats in which these bytes come again in one file
 _SPHERICAL = range(4)  # AVSphericalProjection: equirectangular, cube maps, half of one
 _OF_TWO_CAMERAS = range(1, 8)  # AVStereo3DType: side by side, one above the other, in turn, ...
@@ -107,7 +107,7 @@ def missing_remark(kind: str, times: Sequence[int]) -> str:
 
 
 def _begins_again(path: Path, end: int) -> bool:
-    """Tell whether the first bytes of a file come again after a place."""
+    """Return whether the first bytes of a file come again after a place."""
     if not end < path.stat().st_size:
         return False
     with open(path, "rb") as file, mmap(file.fileno(), 0, access=ACCESS_READ) as data:
@@ -115,7 +115,7 @@ def _begins_again(path: Path, end: int) -> bool:
 
 
 def _has_appended(path: Path) -> bool:
-    """Tell whether another MP4 file was appended to one; players show nothing of it."""
+    """Return whether another MP4 file was appended to one; players show nothing of it."""
     kinds = list(_boxes(path))
     return kinds.count(b"moov") > 1 and b"moof" not in kinds
 

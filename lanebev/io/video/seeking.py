@@ -37,7 +37,7 @@ class StartedVideo(NamedTuple):
 
 @contextmanager
 def open_at(source: str, start: float) -> Iterator[StartedVideo]:
-    """Open a video, at the frame of a time if it can be told without decoding all before; else at its first.
+    """Open a video near the frame of a time, if that surely gives the same frames; else at its first frame.
 
     Args:
         source: its path.

@@ -143,7 +143,7 @@ def _candidates(
 ) -> Tensor:
     """Return which tiles may show a wall: of the ground beyond it, or low in the sky, (E, tiles) bool.
 
-    The line that bounds them is as good as straight within a tile, so one of its corners tells.
+    The line that bounds them is nearly straight within a tile, so testing the corners suffices.
     """
     sky = tile_corners(canvas.depth.isinf().view_as(across), view.size).index_select(1, row)
     ray_x, ray_y, across = (

@@ -74,7 +74,7 @@ def sample_works(sampler: BatchSampler, works: Tensor, layout: Layout) -> tuple[
     whole = sampler.chance(0.4, NUM_OLD)[..., None]
     dash = torch.where(whole, sampler.uniform(9.0, 9.0, 1, 1), sampler.pick_from([3.0, 4.0, 6.0], 1, 1))
     dash = torch.cat([dash, torch.where(whole, dash, sampler.uniform(9.0, 18.0, 1, 1))], 2)
-    faint = torch.where(gold, 1.0, 0.3)  # white ones in force are not to be told from white ones of old
+    faint = torch.where(gold, 1.0, 0.3)  # else old white lines would look like the valid white ones
     left = Works(
         strength=works[:, None]
         * faint

@@ -224,7 +224,7 @@ def dashes_of_lines(kind: Tensor, dashes: Tensor) -> Tensor:
 
 
 def presence(layout: Layout, slot: Tensor, along: Tensor) -> Tensor:
-    """Tell where boundary ``slot`` (B, N) is marked at arc lengths ``along`` (B, N), (B, N) in {0, 1}."""
+    """Return where boundary ``slot`` (B, N) is marked at arc lengths ``along`` (B, N), (B, N) in {0, 1}."""
     period, length, phase = (values.gather(1, slot) for values in layout.gaps)
     return layout.marked.float().gather(1, slot) * (((along + phase) % period) >= length)
 
