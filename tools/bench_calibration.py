@@ -44,6 +44,7 @@ CALIBRATORS: dict[str, Callable[[], Any]] = {
     "textbook EKF": TextbookEKF,
     "joint-hilly-roads": partial(JointCalibrator, HILLY_ROADS),
 }
+PER_BOUNDARY = 8  # segments, of :func:`stream`
 DEFAULT = ("joint", "two-stage", "textbook EKF")
 
 
@@ -92,7 +93,7 @@ def _seconds(value: float | None) -> str:
     return "not" if value is None else f"{value:.2f} s"
 
 
-def stream(frames: int, rows: int, per_boundary: int = 8, seed: int = 0) -> dict[str, Any]:
+def stream(frames: int, rows: int) -> dict[str, Any]:
     """Yield an endless straight drive, its observations drawn from one period of the motion and re-noised.
 
     The same frames go to a float32 and a float64 calibrator.
@@ -102,8 +103,8 @@ def stream(frames: int, rows: int, per_boundary: int = 8, seed: int = 0) -> dict
         the last tenth, and the difference between the precisions in sigmas.
     """
     period = moments(20.0)  # the motion's frequencies are multiples of 0.1 Hz, the drift's of 0.05 Hz
-    bank = list(observe(period, rows, 0.0, per_boundary, seed, torch.float64))
-    generator = torch.Generator().manual_seed(seed + 1)
+    bank = list(observe(period, rows, 0.0, PER_BOUNDARY, 0, torch.float64))
+    generator = torch.Generator().manual_seed(1)
     single, double = JointCalibrator(), JointCalibrator()
     low = single.initial_state(rows, dtype=torch.float32)
     high = double.initial_state(rows, dtype=torch.float64)
@@ -133,7 +134,7 @@ def stream(frames: int, rows: int, per_boundary: int = 8, seed: int = 0) -> dict
     return {
         "frames": frames,
         "rows": rows,
-        "segments_per_boundary": per_boundary,
+        "segments_per_boundary": PER_BOUNDARY,
         "memory_mb": list(memory.values()),
         "smallest_eigenvalue_of_correlation": smallest,
         "rmse_first_tenth": ((squared["first"] / tenth).sqrt() * UNITS).tolist(),

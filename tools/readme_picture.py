@@ -16,16 +16,17 @@ from train.commands import command_parser, one_line_errors
 
 OUT = Path(__file__).resolve().parents[1] / "docs" / "assets" / "before_after.jpg"
 GRID = BEVGrid(x=(-10.0, 10.0), z=(5.0, 40.0), resolution=35 / 360)
+BAR = 26  # px, height of the titles
 
 
-def side_by_side(titled: list[tuple[str, Image.Image]], gap: int = 8, bar: int = 26) -> Image.Image:
+def side_by_side(titled: list[tuple[str, Image.Image]], gap: int = 8) -> Image.Image:
     """Join pictures of one height in a row, each under its title."""
     width = sum(picture.width for _, picture in titled) + gap * (len(titled) - 1)
-    sheet = Image.new("RGB", (width, titled[0][1].height + bar), "white")
+    sheet = Image.new("RGB", (width, titled[0][1].height + BAR), "white")
     draw, font, x = ImageDraw.Draw(sheet), ImageFont.load_default(15), 0
     for title, picture in titled:
         draw.text((x + 4, 4), title, fill="black", font=font)
-        sheet.paste(picture, (x, bar))
+        sheet.paste(picture, (x, BAR))
         x += picture.width + gap
     return sheet
 

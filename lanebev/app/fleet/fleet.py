@@ -5,6 +5,7 @@ import logging
 import math
 import shutil
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, replace
 from itertools import groupby
 from pathlib import Path
@@ -28,7 +29,7 @@ from lanebev.io.output.lock import FolderLock
 from lanebev.io.output.whole_file import whole_file
 from lanebev.io.results import read_extrinsics
 from lanebev.io.state import load_state
-from lanebev.report.verdict import verdict
+from lanebev.report.verdict import Verdict, verdict
 from lanebev.types import AXES
 
 logger = logging.getLogger(__name__)
@@ -83,9 +84,29 @@ def fleet(
             f"output folder {out}: expected a new one or an earlier fleet's, got one with a file {PAGE} and "
             f"no folder {DRIVES}; give another with --out"
         )
+    with _locked(out):
+        found, ran = _run(list(tasks.values()), cluster or Cluster(), again, progress)
+        done = [drive for drive in drives if not found[drive.name].failure]
+        collect_frames(done, out)
+        cameras = camera_mounts(done, out)
+        write_mounts(folder / "mounts.json", cameras)
+        verdicts = {drive.name: _verdict(drive, out) for drive in done}
+        with whole_file(folder / PAGE) as path:
+            page = fleet_page(folder.resolve().name, drives, found, verdicts, cameras)
+            path.write_text(page, encoding="utf-8", errors="replace")
+    return FleetResult(found, _summary(found, ran, out))
+
+
+def _verdict(drive: Drive, out: str) -> Verdict:
+    return verdict(read_extrinsics(drive_folder(out, drive.name) / "extrinsics.csv"), drive.config.stills)
+
+
+@contextmanager
+def _locked(out: str) -> Iterator[None]:
+    """Make a fleet's folder, and lock it against other fleets for the ``with`` block."""
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        lock = FolderLock(folder / ".fleet")
+        Path(out).mkdir(parents=True, exist_ok=True)
+        lock = FolderLock(Path(out) / ".fleet")
         is_free = lock.acquire()
     except OSError as error:
         raise ValueError(
@@ -97,24 +118,10 @@ def fleet(
             f"output folder {out}: expected one that is free, got: another fleet writes into it now"
         )
     try:
-        found, ran = _run(list(tasks.values()), cluster or Cluster(), again, progress)
-        done = [drive for drive in drives if not found[drive.name].failure]
-        collect_frames(done, out)
-        cameras = camera_mounts(done, out)
-        write_mounts(folder / "mounts.json", cameras)
-        verdicts = {
-            drive.name: verdict(
-                read_extrinsics(drive_folder(out, drive.name) / "extrinsics.csv"), drive.config.stills
-            )
-            for drive in done
-        }
-        with whole_file(folder / PAGE) as path:
-            page = fleet_page(folder.resolve().name, drives, found, verdicts, cameras)
-            path.write_text(page, encoding="utf-8", errors="replace")
+        yield
     finally:
         shutil.rmtree(lock.folder, ignore_errors=True)
         lock.release()
-    return FleetResult(found, _summary(found, ran, out))
 
 
 def in_order(drives: Sequence[Drive]) -> list[Drive]:
