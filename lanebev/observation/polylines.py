@@ -88,7 +88,7 @@ def vertices_from_lines(
     check_camera(camera)
     shape = (1, num_boundaries, VERTICES_PER_LINE)
     points, weight, sigma = np.zeros((*shape, 2)), np.zeros(shape), np.ones(shape)
-    lines = [_without_edges(line, camera.image_size[1]) for line in lines]
+    lines = [without_edges(line, camera.image_size[1]) for line in lines]
     for line, index in zip(lines, _indices(lines, camera, num_boundaries), strict=True):
         if index is not None and index < num_boundaries:
             found = _line_vertices(line, camera.image_size)
@@ -107,7 +107,7 @@ def lane_width_ratios(
 
     See :func:`lanebev.observation.boundary_order.width_ratios`.
     """
-    lines = [_without_edges(line, camera.image_size[1]) for line in lines]
+    lines = [without_edges(line, camera.image_size[1]) for line in lines]
     ideal = [_undistorted(line.points, camera) for line in lines]
     return width_ratios(ideal, _indices(lines, camera, NUM_BOUNDARIES), rolls)
 
@@ -183,7 +183,7 @@ def rows_from_vertices(vertices: BoundaryVertices, image_size: tuple[int, int]) 
     return BoundaryRows(rows, x)
 
 
-def _without_edges(line: LaneLine, width: int) -> LaneLine:
+def without_edges(line: LaneLine, width: int) -> LaneLine:
     """Return a polyline with NaN for points that were moved to an edge of the image or repeat an end of it.
 
     Vertices stay.

@@ -10,21 +10,19 @@ from collections.abc import Callable, Iterator
 from pathlib import Path, PurePath
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from lanebev.io.lanes.parsing import (
     FrameLines,
     Where,
     as_list,
     as_object,
-    checked_pixels,
     field,
     json_values,
     lane_text,
     may_bound_lane,
+    point_array,
     stated_size,
 )
-from lanebev.numbers import finite_numbers, shown
+from lanebev.numbers import shown
 from lanebev.observation.polylines import LaneLine
 
 
@@ -93,8 +91,7 @@ def _frame(picture: _Picture) -> FrameLines:
     lines = []
     for i, points in enumerate(picture.drawn):
         name = f"{shown(PurePath(picture.name).name)}, line {i}"
-        pairs = [finite_numbers(name, _pair(name, point), 2) for point in as_list(name, points or [])]
-        lines += [LaneLine(checked_pixels(name, np.array(pairs)))] if pairs else []
+        lines += [LaneLine(point_array(name, points))] if points else []
     size = stated_size(picture.sides, "height", "width") if isinstance(picture.sides, dict) else None
     return FrameLines(picture.name, lines, image_size=size)
 
@@ -102,10 +99,6 @@ def _frame(picture: _Picture) -> FrameLines:
 def _of_lane(label: Any, points: Any) -> Any:
     """Return a line's points; none of one whose label says that it bounds no lane."""
     return points if may_bound_lane(label) else []
-
-
-def _pair(name: str, point: Any) -> list[Any]:
-    return [point.get("x"), point.get("y")] if isinstance(point, dict) else as_list(name, point)
 
 
 def _objects(fields: Any, key: str) -> list[dict[str, Any]]:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lanebev.io.lanes.parsing import (
+    FORMATS,
     FrameLines,
     Where,
     as_list,
@@ -65,6 +66,9 @@ def _frames(path: Path, value: dict[str, Any]) -> Iterator[tuple[str, list[Any]]
     """Yield each frame's name and labels; a file of one image may name it, or be named as it is."""
     frames = as_list("frames", value["frames"]) if "frames" in value else [value]
     for frame in map(as_object, frames):
+        if {"name", "labels", "objects"}.isdisjoint({*frame, *value}):
+            got = shown(", ".join(frame))
+            raise ValueError(f"frames: expected name and labels, as BDD100K has, got {got}; {FORMATS}")
         name = frame.get("name", value.get("name", path.stem))
         if not isinstance(name, str) or not name:
             raise ValueError(f"name: expected the image's, got {shown(name)}")

@@ -149,6 +149,17 @@ def number_array(name: str, values: Any, count: int) -> NDArray[np.float64]:
     return np.array(finite_numbers(name, as_list(name, values), count), dtype=np.float64)
 
 
+def point_array(name: str, points: Any) -> NDArray[np.float64]:
+    """Return points, each [x, y] or {"x": x, "y": y}, as (P, 2) px; else it is a ValueError."""
+    pairs = [
+        finite_numbers(
+            name, [point.get("x"), point.get("y")] if isinstance(point, dict) else as_list(name, point), 2
+        )
+        for point in as_list(name, points)
+    ]
+    return checked_pixels(name, np.array(pairs, dtype=np.float64).reshape(-1, 2))
+
+
 def columns(name: str, values: list[Any], count: int) -> NDArray[np.float64]:
     """Return ``count`` lists of one length as (count, P); NaN for missing numbers."""
     lists = len(values) == count and all(isinstance(axis, list) for axis in values)

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lanebev.io.lanes.parsing import FrameLines
+from lanebev.observation.polylines import without_edges
 
 _STATE_SIZE = "state their size with --lanes-size WIDTHxHEIGHT"
 _OUTSIDE = 0.1  # share of points below or far beside the images, of which more are of another size
@@ -171,9 +172,10 @@ def _doubt_of_points(frames: Sequence[FrameLines], image_size: tuple[int, int]) 
     if not len(points):
         return None
     column, horizon = meeting_point(frames)
+    drawn = _all_points([_without_padding(frame, image_size[1]) for frame in frames])
     return (
         _doubt_of_bounds(points, column, image_size)
-        or _doubt_of_horizon(points, horizon, image_size[0])
+        or _doubt_of_horizon(drawn, horizon, image_size[0])
         or _doubt_of_empty_part(points, column, horizon, image_size)
     )
 
@@ -210,6 +212,8 @@ def _doubt_of_bounds(
 def _doubt_of_horizon(points: NDArray[np.float64], horizon: float, height: int) -> SizeDoubt | None:
     """Return a doubt if all or many points lie above the row where lines meet."""
     y = points[:, 1]
+    if not len(y):
+        return None
     if horizon > y.max():
         return SizeDoubt(
             f"they meet at row {horizon:.0f}, below all of their points; are rows counted from below, or in "
@@ -247,6 +251,11 @@ def _doubt_of_empty_part(
         "of images whose top was cut off?",
         f"state the part with --lanes-crop WIDTHxHEIGHT+LEFT+TOP, such as {width}x{height - rest}+0+{rest}",
     )
+
+
+def _without_padding(frame: FrameLines, width: int) -> FrameLines:
+    """Return a frame without points that are no part of its lines, in images of a width (px)."""
+    return frame._replace(lines=[without_edges(line, width) for line in frame.lines])
 
 
 def meeting_point(frames: Sequence[FrameLines]) -> tuple[float, float]:

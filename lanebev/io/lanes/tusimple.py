@@ -23,6 +23,7 @@ from lanebev.io.lanes.parsing import (
     json_values,
     lane_text,
     number_array,
+    point_array,
 )
 from lanebev.numbers import finite_numbers, numbers_or_gaps, shown
 from lanebev.observation.boundary_vertices import BoundaryVertices
@@ -35,7 +36,8 @@ _TUSIMPLE_ROWS = {56: range(160, 720, 10), 48: range(240, 720, 10)}  # of the be
 def read_tusimple(path: str | Path) -> list[FrameLines]:
     """Read TuSimple JSON, an object a line or in a list: ``lanes``, ``h_samples``, ``raw_file``, and our own.
 
-    Predictions for TuSimple's benchmark leave ``h_samples`` out; theirs are the rows of its labels.
+    Predictions for TuSimple's benchmark leave ``h_samples`` out; theirs are the rows of its labels. Lanes may
+    also be lists of points, without rows.
     """
     frames = []
     for line, value in json_values(path, lane_text(Path(path))):
@@ -115,7 +117,10 @@ def _tusimple_frame(fields: dict[str, Any]) -> FrameLines:
 
 
 def _rows(fields: dict[str, Any]) -> NDArray[np.float64]:
-    """Return the rows (R,) px at which lanes have points."""
+    """Return the rows (R,) px at which lanes have points; none if they are lists of points."""
+    lanes = fields.get("lanes")
+    if isinstance(lanes, list) and any(map(_are_points, lanes)):
+        return np.zeros(0)
     if "h_samples" in fields:
         rows = finite_numbers("h_samples", field(fields, "h_samples", list))
     else:
@@ -141,13 +146,26 @@ def _lane_lines(fields: dict[str, Any], rows: NDArray[np.float64]) -> list[LaneL
         raise ValueError("sigma: expected a list per lane, got another number of them")
     lines = []
     for i, (lane, index, noise) in enumerate(zip(lanes, indices, sigmas, strict=True)):
-        x = _on_h_samples(f"lanes[{i}]", lane, len(rows))
-        sigma = None if noise is None else _on_h_samples(f"sigma[{i}]", noise, len(rows))
-        if sigma is not None and not (sigma[np.isfinite(x)] > 0).all():
+        points = _points(f"lanes[{i}]", lane, rows)
+        there = np.isfinite(points[:, 0])
+        sigma = None if noise is None else _on_rows(f"sigma[{i}]", noise, len(points))
+        if sigma is not None and not (sigma[there] > 0).all():
             raise ValueError(f"sigma[{i}]: expected px above 0 where the lane is, got {shown(noise)}")
-        if np.isfinite(x).any():
-            lines.append(LaneLine(np.stack([x, rows], axis=-1), index, sigma))
+        if there.any():
+            lines.append(LaneLine(points, index, sigma))
     return lines
+
+
+def _are_points(lane: Any) -> bool:
+    return isinstance(lane, list) and bool(lane) and isinstance(lane[0], list | dict)
+
+
+def _points(name: str, lane: Any, rows: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the points (P, 2) px of a lane, NaN in x where it is not there."""
+    points = point_array(name, lane) if _are_points(lane) else None
+    x = _on_rows(name, lane, len(rows)) if points is None else points[:, 0]
+    x[x < 0] = np.nan  # -2 is "not there", as null and NaN are
+    return np.stack([x, rows], axis=-1) if points is None else points
 
 
 def _boundary_indices(fields: dict[str, Any], count: int) -> Sequence[int | None]:
@@ -203,12 +221,10 @@ def _benchmark_rows(fields: dict[str, Any]) -> list[float]:
     return [float(row) for row in _TUSIMPLE_ROWS.get(count, ())]
 
 
-def _on_h_samples(name: str, values: Any, count: int) -> NDArray[np.float64]:
+def _on_rows(name: str, values: Any, count: int) -> NDArray[np.float64]:
     if values == []:  # as some detectors write a lane that they do not see
         return np.full(count, np.nan)
     if not isinstance(values, list) or len(values) != count:
         got = len(values) if isinstance(values, list) else shown(values)
         raise ValueError(f"{name}: expected {count} numbers, one per h_sample, got {got}")
-    x = checked_pixels(name, np.array(numbers_or_gaps(name, values)))
-    x[x < 0] = np.nan  # -2 is "not there", as null and NaN are
-    return x
+    return checked_pixels(name, np.array(numbers_or_gaps(name, values)))

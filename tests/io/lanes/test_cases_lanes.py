@@ -300,6 +300,14 @@ def test_lines_that_go_on_above_the_horizon_are_noticed(top, share):
     assert bool(remark) == bool(share)
 
 
+@pytest.mark.parametrize("padding", [0.0, 1280.0])
+def test_padding_is_not_drawn_beyond_the_road(padding):
+    rows = np.arange(705.0, 0.0, -10.0)
+    lines = [np.where((rows > 320)[:, None], line, np.stack([np.full(len(rows), padding), rows], -1))
+             for line in _lines(rows)]  # fmt: skip
+    assert size_remark([FrameLines("0.png", [LaneLine(line) for line in lines])], (720, 1280)) == ""
+
+
 def _moved(entries, right, down):
     shift = np.array([right, down])
     return [

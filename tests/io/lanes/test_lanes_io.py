@@ -42,6 +42,24 @@ def test_tusimple_lines_may_have_keys_of_other_formats(tmp_path, key):
     assert [len(frame.lines) for frame in read_lanes(path)] == [2]
 
 
+def test_lanes_may_be_lists_of_points(tmp_path):
+    lanes = [[[5, 110], [6.5, 120], [-2, 130]], [{"x": "7", "y": 100}, {"x": 9, "y": 120}], []]
+    entry = {"raw_file": "a.jpg", "lanes": lanes, "boundary": [2, 3, 4], "sigma": [[1, 2, 1], [1, 1], []]}
+    for more in ({}, {"h_samples": [100, 110]}):
+        (frame,) = read_lanes(_write(tmp_path / "l.json", json.dumps({**entry, **more})))
+        np.testing.assert_array_equal(frame.lines[0].points, [[5, 110], [6.5, 120], [np.nan, 130]])
+        np.testing.assert_array_equal(frame.lines[1].points, [[7, 100], [9, 120]])
+        assert [line.boundary for line in frame.lines] == [2, 3]
+        np.testing.assert_array_equal(frame.lines[0].sigma, [1, 2, 1])
+    for lane, message in (
+        ([[5, 110, 1]], r"lanes\[0\]: expected 2 numbers, got 3"),
+        ([[5, 110], 6], r"lanes\[0\]: expected a list, got 6"),
+        ([{"u": 5, "v": 110}], r"lanes\[0\]: expected finite numbers, got None, None"),
+    ):
+        with pytest.raises(ValueError, match=f"line 1: {message}"):
+            read_lanes(_write(tmp_path / "l.json", json.dumps({"raw_file": "a.jpg", "lanes": [lane]})))
+
+
 @pytest.mark.parametrize(("count", "first"), [(56, 160), (48, 240)])
 def test_predictions_for_tusimples_benchmark_leave_the_rows_out(tmp_path, count, first):
     lines = [{"raw_file": "a", "lanes": [[5.0] * count], "run_time": 10}, {"raw_file": "b", "lanes": []}]

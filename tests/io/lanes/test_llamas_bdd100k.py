@@ -160,6 +160,10 @@ def test_bdd100ks_kerbs_and_what_crosses_the_road_are_left_out(tmp_path):
         ([{"name": 1, "labels": []}], "name: expected the image's, got 1"),
         ({"frames": {}}, "frames: expected a list, got {}"),
         ([{"name": "1", "labels": [{"category": "lane"}]}], "poly2d: expected a list, got none"),
+        (
+            {"frames": [{"raw_file": "a.jpg", "lanes": [], "h_samples": []}]},
+            "frames: expected name and labels, as BDD100K has, got 'raw_file, lanes, h_samples'; for",
+        ),
     ],
 )
 def test_what_is_no_bdd100k_is_one_clear_line(tmp_path, value, message):
