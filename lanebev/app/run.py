@@ -116,10 +116,12 @@ def run(
                 recorder.add(done)
                 if viewer is not None:
                     viewer.add(_viewed(done, recorder.rows[-1]), done.frame.image)
-        recorder.problems += source_remarks(source, files, len(recorder.rows))
-        recorder.problems += result_remarks(config, source, observer, tracker, recorder.rows)
-        last = last_frame(source, len(recorder.rows))
-        saved = _save_tracker(tracker, camera, last, out)
+        rows = recorder.rows
+        recorder.problems += source_remarks(source, files, len(rows))
+        tracked = sum(row.status == "TRACKING" for row in rows)
+        upside_down = upside_down_remark(observer, tracker, source, tracked, len(rows))
+        recorder.problems += filter(None, (unfit_mount_remark(config.mount, rows), upside_down))
+        saved = _save_tracker(tracker, camera, last_frame(source, len(rows)), out)
         facts = run_facts(config, source, camera) | facts_of(reusing) | saved
         logger.info("writing the report")
         report = recorder.finish(facts, Path(source.source).name, truth, tracker.mount)
@@ -222,19 +224,6 @@ def setting_remarks(config: RunConfig, source: FrameSource, camera: Camera) -> l
     bars = "" if config.fov is None else bars_remark(first_image(source))
     mount = mount_remark(config.mount, camera)
     return [*filter(None, (bars, mount)), *camera_remarks(camera, source.pixel_aspect)]
-
-
-def result_remarks(
-    config: RunConfig,
-    source: FrameSource,
-    observer: Observer,
-    tracker: RunTracker,
-    rows: Sequence[ExtrinsicsRow],
-) -> list[str]:
-    """Return remarks on a mount that fits in no frame, and on images that are upside down."""
-    tracked = sum(row.status == "TRACKING" for row in rows)
-    upside_down = upside_down_remark(observer, tracker, source, tracked, len(rows))
-    return [*filter(None, (unfit_mount_remark(config.mount, rows), upside_down))]
 
 
 def first_pass(

@@ -144,10 +144,7 @@ def _whole_frames(
 
 
 def _read(
-    container: av.container.InputContainer,
-    frames: Iterator[av.VideoFrame],
-    slot: _Slot,
-    figures: LiveFigures,
+    container: av.container.InputContainer, frames: Iterator[av.VideoFrame], slot: _Slot, figures: LiveFigures
 ) -> None:
     """Take frames until the stream ends or is stopped."""
     try:

@@ -85,9 +85,7 @@ def _save(tensors: Mapping[str, Tensor], path: str, header: dict[str, str]) -> N
 
 
 def load_state(
-    path: str | Path,
-    like: Mapping[str, Any] | None = None,
-    device: torch.device | str | None = None,
+    path: str | Path, like: Mapping[str, Any] | None = None, device: torch.device | str | None = None
 ) -> LoadedState:
     """Read a file of :func:`save_state`. If there is a problem, it is reported and nothing is used.
 

@@ -109,10 +109,7 @@ class LaneSegments(NamedTuple):
 
 @full_precision
 def segments_from_vertices(
-    vertices: BoundaryVertices,
-    intrinsics: Tensor,
-    distortion: Tensor | None = None,
-    model: str = "pinhole",
+    vertices: BoundaryVertices, intrinsics: Tensor, distortion: Tensor | None = None, model: str = "pinhole"
 ) -> LaneSegments:
     """Pair the vertices of each boundary to line segments in undistorted pixels.
 

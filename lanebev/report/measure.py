@@ -124,10 +124,7 @@ def spread(values: NDArray[np.float64]) -> float:
 
 
 def _long_enough(
-    boundary: NDArray[np.int64],
-    z: NDArray[np.float64],
-    rows: NDArray[np.float64],
-    seen: NDArray[np.bool_],
+    boundary: NDArray[np.int64], z: NDArray[np.float64], rows: NDArray[np.float64], seen: NDArray[np.bool_]
 ) -> NDArray[np.bool_]:
     enough = np.zeros(NUM_BOUNDARIES, dtype=bool)
     for k in range(NUM_BOUNDARIES):
@@ -138,10 +135,7 @@ def _long_enough(
 
 
 def _fit(
-    x: NDArray[np.float64],
-    z: NDArray[np.float64],
-    sigma: NDArray[np.float64],
-    boundary: NDArray[np.int64],
+    x: NDArray[np.float64], z: NDArray[np.float64], sigma: NDArray[np.float64], boundary: NDArray[np.int64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Fit offsets (L,), slopes (L,) and the common bend by weighted least squares, with their covariance."""
     member = np.eye(NUM_BOUNDARIES)[boundary]

@@ -40,11 +40,7 @@ class Track(NamedTuple):
 
 
 def track(
-    calibrator: Any,
-    drive: list[Moment],
-    rows: int,
-    sigma: float = 1.0,
-    per_boundary: int = 30,
+    calibrator: Any, drive: list[Moment], rows: int, sigma: float = 1.0, per_boundary: int = 30
 ) -> Track:
     """Run a calibrator over a drive.
 

@@ -21,11 +21,7 @@ _DROP = 1.2  # m, height of a fall
 
 
 def sinusoids(
-    seed: int,
-    largest_deg: float = 1.5,
-    largest_m: float = 0.05,
-    highest_hz: float = 1.2,
-    mount: Pose = MOUNT,
+    seed: int, largest_deg: float = 1.5, largest_m: float = 0.05, highest_hz: float = 1.2, mount: Pose = MOUNT
 ) -> Motion:
     """Draw a motion whose pitch, yaw, roll and height are sums of three sinusoids about the mount.
 
@@ -114,12 +110,7 @@ def fall(t: float) -> Pose:
     landing = landing_time()
     if t < landing:
         left = 1 - t / landing
-        return (
-            -math.radians(3.0) * left,
-            0.0,
-            math.radians(2.0) * left,
-            _DROP - 0.5 * _GRAVITY * t * t,
-        )
+        return (-math.radians(3.0) * left, 0.0, math.radians(2.0) * left, _DROP - 0.5 * _GRAVITY * t * t)
     swing = damped(t - landing, 2.5, 0.4)
     return math.radians(2.0) * swing, 0.0, -math.radians(1.0) * swing, -0.12 * swing
 

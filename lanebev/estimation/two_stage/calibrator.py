@@ -106,12 +106,7 @@ class TwoStageCalibrator(Calibrator[TwoStageState]):
         return TwoStageState(*filters, unseen, *nothing, status, reasons)
 
     def step(
-        self,
-        segments: LaneSegments,
-        intrinsics: Tensor,
-        state: TwoStageState,
-        dt: Tensor,
-        lane_width: Tensor,
+        self, segments: LaneSegments, intrinsics: Tensor, state: TwoStageState, dt: Tensor, lane_width: Tensor
     ) -> tuple[Calibration, TwoStageState]:
         """Process one frame, see :meth:`~lanebev.estimation.calibrator.Calibrator.forward`."""
         guessed = ~dt.isfinite()

@@ -253,10 +253,7 @@ def measure_widths(
 
 
 def initial_roll_height(
-    boundaries: BoundaryAngles,
-    lane_width: Tensor,
-    roll_guess: Tensor,
-    num_iterations: int = 5,
+    boundaries: BoundaryAngles, lane_width: Tensor, roll_guess: Tensor, num_iterations: int = 5
 ) -> tuple[Tensor, Tensor]:
     """Find the roll and height of least :func:`width_energy`.
 

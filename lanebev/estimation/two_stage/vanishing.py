@@ -136,11 +136,7 @@ def intersect_lines(first: Tensor, second: Tensor) -> Tensor:
 
 
 def ransac_vanishing_point(
-    endpoints: Tensor,
-    weight: Tensor,
-    sigma: Tensor,
-    draws: Tensor,
-    gate_sigmas: float = 3.0,
+    endpoints: Tensor, weight: Tensor, sigma: Tensor, draws: Tensor, gate_sigmas: float = 3.0
 ) -> tuple[Tensor, Tensor]:
     """Find the vanishing point hypothesis with the highest score, and the segments that agree with it.
 

@@ -7,12 +7,7 @@ from torch import Tensor
 from lanebev.camera.model import Camera
 from lanebev.io.lanes.contrast import LaneContrast
 from lanebev.io.lanes.parsing import FrameLines
-from lanebev.io.lanes.remarks import (
-    boundary_numbers,
-    left_out_words,
-    repeats_remark,
-    unequal_lanes_remark,
-)
+from lanebev.io.lanes.remarks import boundary_numbers, left_out_words, repeats_remark, unequal_lanes_remark
 from lanebev.io.lanes.size import size_doubt
 from lanebev.observation.frames import image_bytes
 

@@ -123,11 +123,7 @@ def _are_threes(values: list[Any]) -> bool:
 
 
 def _openlane_points(
-    name: str,
-    lane: Any,
-    fields: dict[str, Any],
-    intrinsics: NDArray[np.float64] | None,
-    by_point: bool,
+    name: str, lane: Any, fields: dict[str, Any], intrinsics: NDArray[np.float64] | None, by_point: bool
 ) -> NDArray[np.float64]:
     """Return the points (P, 2) px of a lane line, by its ``uv`` if it has any, else by its ``xyz``.
 

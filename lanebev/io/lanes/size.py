@@ -38,24 +38,16 @@ def resized_lanes(
         image_size: (height, width) px of the result.
     """
     scale = np.array([image_size[1] / size[1], image_size[0] / size[0]])  # of x and y
-    return [
-        _moved(
-            frame._replace(
-                lines=[
-                    line._replace(sigma=None if line.sigma is None else line.sigma * scale[0])
-                    for line in frame.lines
-                ]
-            ),
-            scale,
-            0.5 * scale - 0.5,
-        )
-        for frame in frames
-    ]
+    return [_moved(frame, scale, 0.5 * scale - 0.5) for frame in frames]
 
 
 def _moved(frame: FrameLines, scale: NDArray[np.float64], shift: NDArray[np.float64]) -> FrameLines:
     """Return a frame with all pixels p replaced by scale · p + shift, each (2,)."""
-    lines = [line._replace(points=scale * line.points + shift) for line in frame.lines]
+    sigmas = [None if line.sigma is None else line.sigma * scale[0] for line in frame.lines]
+    lines = [
+        line._replace(points=scale * line.points + shift, sigma=sigma)
+        for line, sigma in zip(frame.lines, sigmas, strict=True)
+    ]
     frame = frame._replace(image_size=None)
     if frame.principal_point is None or frame.focal_length is None:
         return frame._replace(lines=lines)

@@ -75,13 +75,7 @@ def ground_radiance(
 
 
 def _add_headlights(
-    scene: Scene,
-    below: Blocks,
-    x: Tensor,
-    ground: Ground,
-    coverage: Tensor,
-    rows: KindRows,
-    lit: Tensor,
+    scene: Scene, below: Blocks, x: Tensor, ground: Ground, coverage: Tensor, rows: KindRows, lit: Tensor
 ) -> None:
     """Add the own headlights, and at night street lamps, to the irradiance (T, 3, N); changes it.
 

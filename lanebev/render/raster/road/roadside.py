@@ -39,11 +39,7 @@ def add_roadside(scene: Scene, row: Tensor, ground: Ground, paved: Tensor, albed
 
 
 def roadside(
-    street: Street,
-    pavement: Pavement,
-    ground: Ground,
-    eye_across: Tensor,
-    eye_height: Tensor,
+    street: Street, pavement: Pavement, ground: Ground, eye_across: Tensor, eye_height: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Add kerbs, grass, cycle paths and pavements beside the carriageway.
 

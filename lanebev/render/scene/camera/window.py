@@ -40,11 +40,7 @@ class WindowConfig:
 
 
 def window_from_native(
-    sampler: BatchSampler,
-    config: WindowConfig,
-    scale: Tensor,
-    size: tuple[int, int],
-    vanishing_point: Tensor,
+    sampler: BatchSampler, config: WindowConfig, scale: Tensor, size: tuple[int, int], vanishing_point: Tensor
 ) -> Tensor:
     """Sample the maps from native pixels to pixels of windows about the horizon.
 

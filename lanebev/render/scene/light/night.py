@@ -126,10 +126,7 @@ def sample_lights(sampler: BatchSampler, night: Tensor, left: Tensor, right: Ten
         spot_colour=sampler.pick_from(SPOT_COLOURS, NUM_SPOTS),
         halo=on * sampler.either(0.75, (0.0, 0.12), (0.05, 0.6)),
         halo_size=sampler.uniform(0.008, 0.04),
-        streak=torch.stack(
-            [sampler.sometimes(0.35, 0.1, 0.8), sampler.uniform(0.6, 2.5)],
-            dim=1,
-        ),
+        streak=torch.stack([sampler.sometimes(0.35, 0.1, 0.8), sampler.uniform(0.6, 2.5)], dim=1),
         mirror=on * wet,
         smear=on * sampler.either(0.7, (0.0, 0.8), (0.5, 2.0)),
     )

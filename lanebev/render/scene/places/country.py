@@ -18,7 +18,7 @@ from lanebev.render.scene.objects.surroundings import (
     TREES,
     Surroundings,
 )
-from lanebev.render.scene.road.layout import DASHED, MAX_BOUNDARIES, NONE, SOLID, Layout, no_symbols
+from lanebev.render.scene.road.layout import DASHED, MAX_BOUNDARIES, NONE, SOLID, Layout, dashes_of_lines
 from lanebev.render.scene.road.pavement import Pavement
 from lanebev.render.scene.sampler import BatchSampler
 
@@ -39,9 +39,7 @@ def country_layout(
     outer = (index == 0) | (index == lanes[:, None])
     kind = torch.where((style == _MIDDLE) & middle, torch.where(sampler.chance(0.7, 1), DASHED, SOLID), NONE)
     kind = torch.where((style == _EDGES) & outer, torch.where(sampler.chance(0.7, 1), SOLID, DASHED), kind)
-    solid = layout.dash[..., 1:].expand_as(layout.dash)
-    dashed = torch.stack([sampler.uniform(1.5, 5.0), sampler.uniform(6.0, 12.0)], 1)[:, None, None]
-    dash = torch.where((kind == DASHED)[..., None, None], dashed.expand_as(layout.dash), solid)
+    dashes = torch.stack([sampler.uniform(1.5, 5.0, 1), sampler.uniform(6.0, 12.0, 1)], 2)
     narrow = layout._replace(
         across=across,
         exists=exists,
@@ -49,11 +47,11 @@ def country_layout(
         lane_width=width,
         stripe_width=sampler.uniform(0.08, 0.14, 1).expand(-1, MAX_BOUNDARIES).contiguous(),
         separation=torch.zeros_like(layout.separation),
-        dash=dash,
+        dash=dashes_of_lines(kind, dashes.expand(-1, MAX_BOUNDARIES, -1)),
         opacity=torch.where(kind == NONE, 0.0, sampler.uniform(0.4, 1.0, 1)),
         stud_period=torch.zeros_like(layout.stud_period),
         ghost=torch.zeros_like(layout.ghost),
-        symbols=no_symbols(layout.symbols),
+        symbols=layout.symbols._replace(kind=torch.zeros_like(layout.symbols.kind)),
     )
     lane = (sampler.chance(0.85) & (lanes == 2)).long()
     return select_rows(country, narrow, layout), torch.where(country, lane, ego_lane)

@@ -104,6 +104,5 @@ def tunnel_light(light: Light, tunnel: Tunnel) -> Light:
     """Return the illumination inside: that of the lamps alone."""
     on = (tunnel.on > 0)[:, None]
     return light._replace(
-        direct=torch.where(on, 0.0, light.direct),
-        ambient=torch.where(on, tunnel.level, light.ambient),
+        direct=torch.where(on, 0.0, light.direct), ambient=torch.where(on, tunnel.level, light.ambient)
     )

@@ -8,7 +8,15 @@ from torch import Tensor
 from lanebev.batch import select_rows
 from lanebev.render.scene.objects.objects import POLE
 from lanebev.render.scene.objects.traffic import Traffic
-from lanebev.render.scene.road.layout import DASHED, MAX_BOUNDARIES, NONE, SOLID, WHITE, Layout
+from lanebev.render.scene.road.layout import (
+    DASHED,
+    MAX_BOUNDARIES,
+    NONE,
+    SOLID,
+    WHITE,
+    Layout,
+    dashes_of_lines,
+)
 from lanebev.render.scene.sampler import BatchSampler
 
 NUM_OLD = 4  # old white lines
@@ -49,8 +57,7 @@ def sample_works(sampler: BatchSampler, works: Tensor, layout: Layout) -> tuple[
     widths = (sampler.uniform(2.6, 3.4, 1) + sampler.normal(0.12, slots - 1)).clamp(2.4, 3.7)
     across = torch.nn.functional.pad(widths.cumsum(1), (1, 0))
     across = torch.where(layout.exists, across, layout.across)
-    solid = layout.dash[..., 1:].expand_as(layout.dash)
-    dashed = torch.stack([sampler.uniform(1.0, 6.0), sampler.uniform(7.0, 14.0)], 1)[:, None, None]
+    dashes = torch.stack([sampler.uniform(1.0, 6.0, 1), sampler.uniform(7.0, 14.0, 1)], 2)
     gold = sampler.chance(0.85, 1)
     colour = torch.where(
         gold[..., None], layout.colour.new_tensor([0.78, 0.52, 0.03]), layout.colour.new_tensor(WHITE)
@@ -61,7 +68,7 @@ def sample_works(sampler: BatchSampler, works: Tensor, layout: Layout) -> tuple[
         lane_width=widths.mean(1),
         stripe_width=sampler.uniform(0.10, 0.18, 1).expand(-1, slots).contiguous(),
         separation=torch.zeros_like(layout.separation),
-        dash=torch.where((kind == DASHED)[..., None, None], dashed.expand_as(layout.dash), solid),
+        dash=dashes_of_lines(kind, dashes.expand(-1, slots, -1)),
         colour=(colour * sampler.uniform(0.8, 1.15, 1, 1)).expand(-1, slots, -1).contiguous(),
         opacity=torch.where(kind == NONE, 0.0, sampler.uniform(0.75, 1.0, 1)),
         wear=sampler.uniform(0.0, 0.25, 1).expand(-1, slots).contiguous(),

@@ -14,7 +14,6 @@ from lanebev.render.scene.road.layout import (
     Layout,
     boundary_places,
     dashes_of_lines,
-    no_symbols,
 )
 from lanebev.render.scene.sampler import BatchSampler
 
@@ -82,7 +81,7 @@ def sample_city_layout(sampler: BatchSampler, base: Layout) -> tuple[Layout, Ten
         colour=colour.expand(-1, slots, -1).contiguous(),
         opacity=torch.where(kind == NONE, 0.0, opacity),
         stud_period=torch.zeros_like(width).expand(-1, slots).contiguous(),
-        symbols=no_symbols(base.symbols),
+        symbols=base.symbols._replace(kind=torch.zeros_like(base.symbols.kind)),
     )
     ego_lane = first + (sampler.uniform(0, 1) * own).long().minimum(own - 1)
     return layout, ego_lane, first, own

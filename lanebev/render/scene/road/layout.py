@@ -153,11 +153,6 @@ def sample_layout(sampler: BatchSampler, dotted: Tensor, faint: Tensor) -> Layou
     )
 
 
-def no_symbols(like: Symbols) -> Symbols:
-    """Return symbols of which none is painted."""
-    return like._replace(kind=torch.zeros_like(like.kind))
-
-
 def boundary_places(widths: Tensor, exists: Tensor) -> Tensor:
     """Return the places (B, K) m of boundaries by lane widths (B, K - 1) m; missing ones lie far away."""
     across = torch.nn.functional.pad(widths.cumsum(1), (1, 0))
