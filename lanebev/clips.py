@@ -1,11 +1,16 @@
 """Clips of T frames: their intrinsics, numbers such as time steps, and the frames that begin a drive."""
 
+import warnings
+
 import torch
 from torch import Tensor, nn
 
+from lanebev.batch import readable
 from lanebev.geometry.lens import check_intrinsics
 from lanebev.geometry.precision import common_dtype
 from lanebev.types import check_number_or_tensor, check_tensor
+
+_LONG_DT = 5.0  # s
 
 
 def frame_cameras(intrinsics: Tensor, image: Tensor) -> Tensor:
@@ -46,6 +51,19 @@ def per_frame(name: str, value: float | Tensor, batch: int, steps: int, like: Te
     if numbers.ndim > 2 or numbers.shape[0] not in (1, batch) or numbers.shape[1] not in (1, steps):
         raise ValueError(f"{name}: expected a float, ({batch},) or ({batch}, {steps}), got {got}")
     return numbers.expand(batch, steps)
+
+
+def doubt_intervals(intervals: Tensor) -> None:
+    """Warn if all time steps (B, T) s after frames of a drive are longer than those of a camera.
+
+    Where reading numbers would wait for a device, there is no warning.
+    """
+    if readable(intervals) and intervals.numel() and bool((intervals > _LONG_DT).all()):
+        warnings.warn(
+            f"dt: expected seconds since the frame before, got {float(intervals.min()):g} or more in all "
+            "frames; of milliseconds give dt / 1000",
+            stacklevel=3,
+        )
 
 
 def drive_starts(reset: Tensor, batch: int, steps: int) -> Tensor:

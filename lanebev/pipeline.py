@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from lanebev.batch import select_rows
-from lanebev.clips import drive_starts, frame_cameras, per_frame
+from lanebev.clips import doubt_intervals, drive_starts, frame_cameras, per_frame
 from lanebev.estimation.calibrator import Calibrator
 from lanebev.estimation.expected_view import expected_vanishing_point
 from lanebev.geometry.lens import check_distortion
@@ -236,6 +236,9 @@ class LaneBEV(BoundaryDetector):
         begins = None if reset is None else drive_starts(reset, batch, steps)
         check_devices({"image": image, "intrinsics": intrinsics, "distortion": distortion, "reset": begins})
         doubt_intrinsics(intrinsics, (image.shape[-2], image.shape[-1]))
+        intervals = per_frame("dt", dt, batch, steps, intrinsics)
+        if state is not None:
+            doubt_intervals(intervals)
         if state is None or begins is not None:
             dtype = common_dtype(intrinsics) if state is None else state[0].dtype
             fresh = self.initial_state(batch, dtype, image.device)

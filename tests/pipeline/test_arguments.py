@@ -337,6 +337,19 @@ def test_an_interval_that_is_no_number(model):
         model(IMAGE, SMALL_K, dt=None)
 
 
+@pytest.mark.parametrize("dt", [33, torch.tensor([33.0])])
+def test_milliseconds_are_doubted(model, dt):
+    _, state = model(IMAGE, SMALL_K)
+    with pytest.warns(
+        UserWarning, match="dt: expected seconds .*, got 33 or more in all frames; of milliseco"
+    ):
+        model(IMAGE, SMALL_K, state, dt)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        model(IMAGE, SMALL_K, state, torch.tensor(1.0))
+        model(IMAGE.expand(2, -1, -1, -1), SMALL_K.expand(2, -1, -1), dt=dt)  # of a first frame
+
+
 def test_a_speed_that_does_not_fit(model):
     with pytest.raises(ValueError, match=r"speed: expected a float, \(1,\) or \(1, 1\), got \(2,\)"):
         model(IMAGE, SMALL_K, speed=torch.ones(2))
