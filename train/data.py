@@ -130,7 +130,7 @@ class ViewBatches(IterableDataset[Batch]):
     first: int = 0
 
     def __iter__(self) -> Iterator[Batch]:
-        """Draw."""
+        """Yield the batches."""
         worker = get_worker_info()
         if worker is not None:
             torch.set_num_threads(1)
@@ -157,7 +157,7 @@ class FullBatches(IterableDataset[Batch]):
     batches: int
 
     def __iter__(self) -> Iterator[Batch]:
-        """Draw."""
+        """Yield the batches."""
         frames = self.frames((self.seed,))
         for _ in range(self.batches):
             yield Batch.stack([full_view(next(frames), self.size, self.view) for _ in range(self.batch_size)])

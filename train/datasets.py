@@ -42,7 +42,7 @@ class ScoredBatch(NamedTuple):
     Attributes:
         views: images and label maps at the network's size.
         lines: the label of each image, in its own pixels.
-        image_sizes: (height, width) of each image as it came.
+        image_sizes: (height, width) of each image as taken.
         benchmark: the benchmark whose rules apply.
     """
 
@@ -165,7 +165,7 @@ class ScoredBatches(IterableDataset[ScoredBatch]):
     view: ViewConfig
 
     def __iter__(self) -> Iterator[ScoredBatch]:
-        """Draw."""
+        """Yield the batches."""
         for start in range(0, len(self.entries), self.batch_size):
             entries = self.entries[start : start + self.batch_size]
             samples = [labelled_image(entry) for entry in entries]

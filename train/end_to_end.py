@@ -99,7 +99,7 @@ class EndToEnd(Segmentation):
         self.val_frames += said.sum(0)
 
     def on_validation_epoch_start(self) -> None:
-        """Collect anew."""
+        """Forget the figures of the epoch before."""
         super().on_validation_epoch_start()
         self.val_squares, self.val_frames = torch.zeros_like(self.unit), torch.zeros_like(self.unit)
 

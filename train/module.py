@@ -178,7 +178,7 @@ class Segmentation(L.LightningModule):
         self.val_there += there.sum(0)
 
     def on_validation_epoch_start(self) -> None:
-        """Count anew."""
+        """Forget the figures of the epoch before."""
         self.val_found = torch.zeros(self.segmenter.config.num_boundaries, device=self.device)
         self.val_there = torch.zeros_like(self.val_found)
 

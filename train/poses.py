@@ -68,7 +68,7 @@ class PoseBatches(IterableDataset[PoseBatch]):
     first: int = 0
 
     def __iter__(self) -> Iterator[PoseBatch]:
-        """Draw."""
+        """Yield the batches."""
         samples = self.frames.posed(self.seed, self.first * self.batch_size)
         for _ in itertools.count() if self.batches is None else range(self.batches):
             yield PoseBatch.stack([next(samples) for _ in range(self.batch_size)], self.size, self.view)

@@ -78,7 +78,7 @@ def smoothed(curves: Boundaries, reach: int, least: float = 0.5) -> tuple[Bounda
 
 
 def label_rows(curves: Boundaries, camera: Camera, extrinsics: Extrinsics) -> NDArray[np.float64]:
-    """Draw curves on the rows of ``lanes.json``: (F, L, R) px of the image as it came, NaN for none."""
+    """Draw curves on the rows of ``lanes.json``: (F, L, R) px of the image as taken, NaN for none."""
     intrinsics = camera.intrinsics.to(curves.offset).expand(len(curves.offset), 3, 3)
     lines, shown = boundary_polylines(curves, intrinsics, extrinsics, num_points=96)
     return np.stack([curves_on_rows(*each, camera) for each in zip(lines, shown, strict=True)])

@@ -112,7 +112,7 @@ def run(
         frames = observed_frames(source, last_observer)
         with recorder, closing(frames), ended_by_signals(source):
             shown = progress(frames, source.taken_count)
-            for done in estimates(shown, config, source, tracker, smoothed):
+            for done in recorded_frames(shown, config, source, tracker, smoothed):
                 recorder.add(done)
                 if viewer is not None:
                     viewer.add(_viewed(done, recorder.rows[-1]), done.frame.image)
@@ -152,7 +152,7 @@ def open_inputs(config: RunConfig) -> tuple[RunConfig, FrameSource, Camera]:
     return config, source, camera
 
 
-def estimates(
+def recorded_frames(
     frames: Iterator[tuple[Frame, Observation]],
     config: RunConfig,
     source: FrameSource,

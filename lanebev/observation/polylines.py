@@ -37,7 +37,7 @@ class LaneLine(NamedTuple):
     """One line as a detector or a person drew it.
 
     Attributes:
-        points: (P, 2) px, (x, y) of the image as it came; x is NaN in a gap of the line.
+        points: (P, 2) px, (x, y) of the image as taken; x is NaN in a gap of the line.
         boundary: index of the semantic boundary if the source states it, else None.
         sigma: (P,) px, standard deviation of each point across the line if the source states it, else None.
         weight: (P,) in [0, 1], confidence in each point, if the points are vertices with independent errors;
@@ -51,7 +51,7 @@ class LaneLine(NamedTuple):
 
 
 class BoundaryRows(NamedTuple):
-    """One frame's boundaries on rows of the image as it came.
+    """One frame's boundaries on rows of the image as taken.
 
     Attributes:
         rows: (R,) px, rising.

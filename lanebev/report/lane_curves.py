@@ -30,7 +30,7 @@ def lane_curves(
         vertical_curvature: (1,) 1/m of the road, or None for a plane.
 
     Returns:
-        (L, R) px of the image as it came; none of them where the pose is not known.
+        (L, R) px of the image as taken; none of them where the pose is not known.
     """
     rows = image_rows(camera.image_size[0])
     if int(calibration.status[0]) not in (Status.TRACKING, Status.COASTING):
@@ -55,7 +55,7 @@ def curves_on_rows(lines: Tensor, shown: Tensor, camera: Camera) -> NDArray[np.f
         camera: the lens.
 
     Returns:
-        (L, R) px of the image as it came, NaN where there is no curve.
+        (L, R) px of the image as taken, NaN where there is no curve.
     """
     rows = image_rows(camera.image_size[0])
     x = np.full((len(lines), len(rows)), np.nan)

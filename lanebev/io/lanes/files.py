@@ -1,6 +1,6 @@
 """Lane files of other detectors and data sets, and which frame each entry belongs to.
 
-Everything here is in pixels of the image as it came. A cut or malformed file is a ``ValueError`` of one line
+Everything here is in pixels of the image as taken. A cut or malformed file is a ``ValueError`` of one line
 that names file and line.
 """
 
