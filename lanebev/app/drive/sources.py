@@ -159,7 +159,7 @@ def camera_of(config: RunConfig, source: FrameSource) -> Camera:
         )
     try:
         rectified = config.rectified or bool(_RECTIFIED.search(source.topic))
-        return Camera.from_fields(source.lens, rectified)
+        return replace(Camera.from_fields(source.lens, rectified), remark=source.lens_remark)
     except ValueError as error:
         raise ValueError(f"camera of bag {source.source}: {error}; give --camera FILE") from error
 

@@ -22,7 +22,7 @@ from lanebev.io.images.pixels import dark_remark
 from lanebev.io.rising_clock import RisingClock
 from lanebev.io.side_by_side import halves_remark
 
-_LOOKED_AT = 50  # frames, for their rate
+_LOOKED_AT = 50  # frames for their rate, and messages for the lens
 _LONGEST_GROUP = 600  # frames, which a video in a bag may begin before its first key frame
 _LENS_FIELDS = ("width", "height", "distortion_model", "D", "K", "R", "P", "binning_x", "binning_y")
 _REGION = ("x_offset", "y_offset", "height", "width")
@@ -35,10 +35,12 @@ class BagSource(FrameSource):
     Attributes:
         topic: topic of the images.
         lens: fields of a ``camera_info`` beside them, None if there is none.
+        lens_remark: a remark on it; else empty.
     """
 
     topic: str = ""
     lens: Mapping[str, Any] | None = field(default=None, compare=False)
+    lens_remark: str = field(default="", compare=False)
 
     @cached_property  # once: the times are in all messages
     def taken_numbers(self) -> list[int]:
@@ -98,9 +100,10 @@ def open_bag_source(source: str, topic: str | None = None, fps: Fraction | None 
         image = _first_image(bag, chosen.name)
         if image is None:
             raise ValueError(f"bag {source}: expected images on {chosen.name}, got none")
-        lens = _lens(bag, chosen.name)
+        lenses = _lenses(bag, chosen.name)
     rate, size = fps or DEFAULT_FPS, image.shape[:2]
-    found = BagSource(source, (), rate, chosen.size, size, topic=chosen.name, lens=lens)
+    lens, doubt = (lenses[0] if lenses else None), _lenses_remark(lenses)
+    found = BagSource(source, (), rate, chosen.size, size, topic=chosen.name, lens=lens, lens_remark=doubt)
     clock = RisingClock(float(1 / found.fps))
     steps = [after - before for before, after in pairwise(islice(found.frame_times(clock), _LOOKED_AT))]
     rate = fps or (Fraction(1 / median(steps)).limit_denominator(1000) if steps else rate)
@@ -146,8 +149,25 @@ def lens_fields(message: Any) -> dict[str, Any]:
     return fields
 
 
-def _lens(bag: Bag, images: str) -> dict[str, Any] | None:
-    """Return the lens of the topic nearest to the images, or of a bag's only camera; None without one.
+def _lenses_remark(lenses: Sequence[Mapping[str, Any]]) -> str:
+    """Return a remark if the messages of a lens differ, as those of a focus that moves; else nothing."""
+    other = next((each for each in lenses if each != lenses[0]), None)
+    if other is None:
+        return ""
+    before, after = (
+        f"{each['K'][0]:g} px for {each.get('width')} x {each.get('height')} px"
+        for each in (lenses[0], other)
+    )
+    return (
+        f"CameraInfo changes, its focal length from {before} to {after}; the first is taken for all images: "
+        "fix focus and resolution, or give --camera FILE"
+    )
+
+
+def _lenses(bag: Bag, images: str) -> list[dict[str, Any]]:
+    """Return the first lenses of the topic nearest to the images, or of a bag's only camera.
+
+    Messages of a camera that is not calibrated are left out: drivers send them until they are set up.
 
     Of several as near, such as ``camera_info`` and ``camera_info_raw``, it is that with the most words of the
     images' topic and the fewest others.
@@ -162,13 +182,12 @@ def _lens(bag: Bag, images: str) -> dict[str, Any] | None:
         return len(folders[name]), len(words[name] & words[images]), -len(words[name] - words[images])
 
     nearest = sorted(beside, key=fit)[-1:]
+    found = []
     for name in nearest or (topics if len(topics) == cameras == 1 else []):
-        for _, message in bag.messages(name):
-            try:
-                return lens_fields(message)
-            except ValueError:
-                return None
-    return None
+        for _, message in islice(bag.messages(name), _LOOKED_AT):
+            with contextlib.suppress(ValueError):
+                found.append(lens_fields(message))
+    return found
 
 
 def _image_topic(source: str, topics: Sequence[Topic], wanted: str | None) -> Topic:

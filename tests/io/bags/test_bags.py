@@ -176,6 +176,41 @@ def _ros1_bag(path):
     return path
 
 
+@pytest.mark.parametrize(
+    ("focals", "words"),
+    [
+        ((0, 0, 60, 60), ""),
+        (
+            (60, 60, 63),
+            "CameraInfo changes, its focal length from 60 px for 64 x 48 px to 63 px for 64 x 48 px;",
+        ),
+        ((0, 0), None),
+    ],
+)
+def test_a_lens_that_is_set_up_late_or_moves(tmp_path, focals, words):
+    lens, name = tmp_path / "bag", "sensor_msgs/msg/CameraInfo"
+    with Writer(lens, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        info = writer.add_connection("/cam/camera_info", name, typestore=STORE)
+        images = writer.add_connection("/cam/image", "sensor_msgs/msg/CompressedImage", typestore=STORE)
+        for number, focal in enumerate(focals):
+            message = _info()
+            message.k[:] = message.k * (focal / 60)
+            logged = round(1e9 * (START + number))
+            writer.write(info, logged, STORE.serialize_cdr(message, name))
+            picture = STORE.serialize_cdr(_compressed(number), "sensor_msgs/msg/CompressedImage")
+            writer.write(images, logged, picture)
+    config = RunConfig(str(lens), "")
+    source = make_source(config)
+    if words is None:
+        with pytest.raises(ValueError, match="has no calibrated CameraInfo beside /cam/image"):
+            camera_of(config, source)
+        return
+    camera = camera_of(config, source)
+    assert camera.intrinsics[0, 0] == 60
+    assert camera.remark.startswith(words)
+    assert bool(camera.remark) == bool(words)
+
+
 def test_other_topics_that_last_longer_change_no_frame_rate(tmp_path):
     name, info = "sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/CameraInfo"
     with Writer(tmp_path / "bag", version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
