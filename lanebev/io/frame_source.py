@@ -1,9 +1,10 @@
 """Frames of a video or of images, iterated as often as wanted."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from fractions import Fraction
 from itertools import islice
+from typing import ParamSpec
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +16,7 @@ from lanebev.io.speeds import Speeds
 from lanebev.io.video.decoding import rgb
 from lanebev.io.video.seeking import open_at
 
+P = ParamSpec("P")
 DEFAULT_FPS = Fraction(30)
 
 
@@ -95,10 +97,7 @@ class FrameSource:
             if self.times:
                 time, dt = self.times[index], self.times[index] - self.times[index - 1] if index else dt
             if self.selection.takes(index, time):
-                try:
-                    image = self._right_size(read_image(path))
-                except ValueError as error:
-                    problem = str(error)
+                image, problem = self._decoded(read_image, path)
             yield Frame(index, time, dt, path, image, problem)
 
     def _video_frames(self) -> Iterator[Frame]:
@@ -118,16 +117,20 @@ class FrameSource:
                     problem = "up to the next key frame, images may show a lost frame's damage"
                     reported = True
                 if self.selection.takes(index, float(time - first)):
-                    try:
-                        image = self._right_size(rgb(frame, self.matrix))
-                    except ValueError as error:
-                        problem = str(error)
+                    image, fault = self._decoded(rgb, frame, self.matrix)
+                    problem = fault or problem
                 yield Frame(index, float(time - first), dt, "", image, problem)
                 before = time
 
-    def _right_size(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        if image.shape[:2] != self.image_size:
-            height, width = self.image_size
-            got = f"{image.shape[1]} x {image.shape[0]}"
-            raise ValueError(f"expected {width} x {height} like the other frames, got {got}")
-        return image
+    def _decoded(
+        self, decode: Callable[P, NDArray[np.uint8]], *args: P.args, **kwargs: P.kwargs
+    ) -> tuple[NDArray[np.uint8] | None, str]:
+        """Return the decoded image, or None and why there is none of the size of the other frames."""
+        try:
+            image = decode(*args, **kwargs)
+        except ValueError as error:
+            return None, str(error)
+        (height, width), (rows, columns) = self.image_size, image.shape[:2]
+        if (rows, columns) != (height, width):
+            return None, f"expected {width} x {height} like the other frames, got {columns} x {rows}"
+        return image, ""

@@ -104,11 +104,7 @@ class LiveSource(FrameSource):
                 now = float(clock.time(*self._stated(frame))[0]) if self.keep_all else arrival
                 start = now if start is None else start
                 dt = float(1 / self.fps) if before is None else now - before
-                image, problem = None, ""
-                try:
-                    image = self._right_size(rgb(frame, self.matrix))
-                except ValueError as error:
-                    problem = str(error)
+                image, problem = self._decoded(rgb, frame, self.matrix)
                 yield Frame(self.figures.seen, now - start, dt, "", image, problem)
                 before = now
                 self.figures.seen += 1

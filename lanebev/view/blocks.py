@@ -55,18 +55,7 @@ def blocks(cells: Cells, lens: Lens | None, limit: float, memory: Memory | None 
     if isinstance(cells, CellSums) and _may_choose(cells):
         curves = interpolant(cells, lens, limit)
         if curves is not None:
-            for tile, span in enumerate(itertools.pairwise(curves.rows.edges)):
-                smooth = curves.smooth[:, tile]
-                if not smooth.any():
-                    yield from _exact_blocks(
-                        cells, lens, span, ONE_THREAD // 3, memory, image_coordinates_by_one_thread
-                    )
-                elif curves.inside[tile] or memory is None:
-                    yield _tile_block(curves, cells, lens, tile, span, memory)
-                else:
-                    planes = batch * (1 if smooth.all() else 3)  # cell by cell, all coordinates at once
-                    for first, last in _spans(span, ONE_THREAD // (planes * columns)):
-                        yield _tile_block(curves, cells, lens, tile, (first, last), memory)
+            yield from _interpolated_blocks(curves, cells, lens, memory)
             return
     # compiled code has no planes in between
     size = batch * rows * columns if torch.compiler.is_compiling() else BLOCK
@@ -77,6 +66,25 @@ def _may_choose(cells: CellSums) -> bool:
     """Return whether what is computed may depend on values, and interpolation is as exact as the numbers."""
     by_row = cells.by_row
     return by_row.dtype == torch.float32 and by_row.device.type == "cpu" and not traced()
+
+
+def _interpolated_blocks(
+    curves: Interpolant, cells: CellSums, lens: Lens | None, memory: Memory | None
+) -> Iterator[Block]:
+    """Yield all rows tile by tile: by polynomials where they are exact in an image, else cell by cell."""
+    batch, _, columns = cells.shape
+    for tile, span in enumerate(itertools.pairwise(curves.rows.edges)):
+        smooth = curves.smooth[:, tile]
+        if not smooth.any():
+            yield from _exact_blocks(
+                cells, lens, span, ONE_THREAD // 3, memory, image_coordinates_by_one_thread
+            )
+        elif curves.inside[tile] or memory is None:
+            yield _tile_block(curves, cells, lens, tile, span, memory)
+        else:
+            planes = batch * (1 if smooth.all() else 3)  # cell by cell, all coordinates at once
+            for rows in _spans(span, ONE_THREAD // (planes * columns)):
+                yield _tile_block(curves, cells, lens, tile, rows, memory)
 
 
 def _exact_blocks(

@@ -103,13 +103,12 @@ def run(
         if part in GROWTHS:
             title, sizes, make = GROWTHS[part]
             by_size: dict[int, Table] = {}
-            for size in sizes:
-                slowest = max(
-                    (entry["ms"] for table in by_size.values() for entry in table.values()), default=0
-                )
-                if size <= largest and slowest < 1e3 * longest:
+            slowest = 0.0
+            for size in (size for size in sizes if size <= largest):
+                if slowest < 1e3 * longest:
                     with torch.no_grad():
                         by_size[size] = measure(make(size), seconds, clock)
+                    slowest = max(slowest, *(entry["ms"] for entry in by_size[size].values()))
             results[title] = {str(size): table for size, table in by_size.items()}
             texts.append(grown(title, by_size))
             print(texts[-1], flush=True)

@@ -88,14 +88,15 @@ def main() -> int:
                 begin = time.perf_counter()
                 found = fault(reader, data, Path(folder), args.limit)
                 slowest = max(slowest, time.perf_counter() - begin)
-                if found:
-                    kind = f"{name}: {found}"
-                    if not faults[kind]:
-                        print(kind, flush=True)
-                        if args.keep:
-                            args.keep.mkdir(parents=True, exist_ok=True)
-                            (args.keep / f"{len(faults)}-{name}{reader.suffix}").write_bytes(data)
-                    faults[kind] += 1
+                if not found:
+                    continue
+                kind = f"{name}: {found}"
+                faults[kind] += 1
+                if faults[kind] == 1:
+                    print(kind, flush=True)
+                    if args.keep:
+                        args.keep.mkdir(parents=True, exist_ok=True)
+                        (args.keep / f"{len(faults) - 1}-{name}{reader.suffix}").write_bytes(data)
             print(f"{name}: {count} inputs, the slowest took {slowest:.2f} s", flush=True)
     print(f"{args.count} inputs, {sum(faults.values())} faults of {len(faults)} kinds")
     return 1 if faults else 0

@@ -70,12 +70,10 @@ class BagSource(FrameSource):
                     time, problem = clock.time(message_stamp(message), 1e-9 * logged)
                     first = time if first is None else first
                     dt = interval if before is None else time - before
-                    image = None
+                    image, fault = None, ""
                     if self.selection.takes(number, time - first) or is_video(message):
-                        try:
-                            image = self._right_size(images(message))
-                        except ValueError as error:
-                            problem = str(error)
+                        image, fault = self._decoded(images, message)
+                    problem = fault or problem
                     yield Frame(number, time - first, dt, "", image, problem)
                     before = time
         except ValueError as error:  # from here on the bag cannot be read
