@@ -21,7 +21,7 @@ from lanebev.app.continued.resume import (
     resume_remark,
 )
 from lanebev.app.continued.smoothing import SmoothedPoses, smooth_frames
-from lanebev.app.continued.source_changes import files_of, source_remarks
+from lanebev.app.continued.source_changes import changes_remark, count_remark, files_of
 from lanebev.app.convert import writer
 from lanebev.app.drive.build import (
     input_files,
@@ -115,12 +115,13 @@ def run(
             for done in recorded_frames(shown, config, source, tracker, smoothed):
                 recorder.add(done)
                 if viewer is not None:
-                    viewer.add(_viewed(done, recorder.rows[-1]), done.frame.image)
+                    pose, lines = done.estimate.calibration.extrinsics, vertex_lines(done.seen.vertices)
+                    viewer.add(RecordedFrame(recorder.rows[-1], pose, lines), done.frame.image)
         rows = recorder.rows
-        recorder.problems += source_remarks(source, files, len(rows))
         tracked = sum(row.status == "TRACKING" for row in rows)
+        of_source = (changes_remark(source, files), count_remark(source, len(rows)))
         upside_down = upside_down_remark(observer, tracker, source, tracked, len(rows))
-        recorder.problems += filter(None, (unfit_mount_remark(config.mount, rows), upside_down))
+        recorder.problems += filter(None, (*of_source, unfit_mount_remark(config.mount, rows), upside_down))
         saved = _save_tracker(tracker, camera, last_frame(source, len(rows)), out)
         facts = run_facts(config, source, camera) | facts_of(reusing) | saved
         logger.info("writing the report")
@@ -168,11 +169,6 @@ def recorded_frames(
         estimate = filtered if smoothed is None else smoothed.of(filtered, frame.number)
         name = frame_name(frame, source)
         yield Recorded(frame=frame, name=name, seen=seen, estimate=estimate, filtered=filtered)
-
-
-def _viewed(done: Recorded, row: ExtrinsicsRow) -> RecordedFrame:
-    """Return a frame's results as the viewer takes them."""
-    return RecordedFrame(row, done.estimate.calibration.extrinsics, vertex_lines(done.seen.vertices))
 
 
 def _save_tracker(

@@ -129,25 +129,30 @@ def read_mount(path: str | Path) -> MountPrior:
     pose, std = torch.zeros(4, dtype=torch.float64), torch.full((4,), torch.inf, dtype=torch.float64)
     for axis, key in enumerate(_USED_BY_AXIS):
         if key in mount:
-            name, unit = key.rsplit("_", 1)
-            scale = 1.0 if unit == "m" else math.pi / 180
             try:
-                (value,) = finite_numbers(key, [mount[key]], 1)
-                (sigma,) = finite_numbers(f"{name}_std_{unit}", [mount.get(f"{name}_std_{unit}")], 1)
-                low, high = _HEIGHTS if unit == "m" else _ANGLES
-                if not low <= value <= high:
-                    raise ValueError(f"{key}: expected {low:g} to {high:g}, got {value:g}")
-                if not sigma > 0:
-                    raise ValueError(f"{name}_std_{unit}: expected more than 0, got {sigma:g}")
+                pose[axis], std[axis] = _value_and_std(mount, key)
             except ValueError as error:
                 raise ValueError(f"mount file {path}: {error}") from error
-            pose[axis], std[axis] = scale * value, scale * sigma
     if not std.isfinite().any():
         needs = mount.get("needs")
         why = needs[0] if isinstance(needs, list) and needs else None
         why = " ".join(why.split())[:200] if isinstance(why, str) else "no axis is calibrated"
         raise ValueError(f"mount file {path}: expected a calibrated axis, got none: {why}")
     return MountPrior(pose, std)
+
+
+def _value_and_std(mount: dict[str, Any], key: str) -> tuple[float, float]:
+    """Return value and standard deviation of an axis, rad or m."""
+    name, unit = key.rsplit("_", 1)
+    std_key = f"{name}_std_{unit}"
+    (value,), (std,) = finite_numbers(key, [mount[key]], 1), finite_numbers(std_key, [mount.get(std_key)], 1)
+    low, high = _HEIGHTS if unit == "m" else _ANGLES
+    if not low <= value <= high:
+        raise ValueError(f"{key}: expected {low:g} to {high:g}, got {value:g}")
+    if not std > 0:
+        raise ValueError(f"{std_key}: expected more than 0, got {std:g}")
+    scale = 1.0 if unit == "m" else math.pi / 180
+    return scale * value, scale * std
 
 
 def _names(reasons: int) -> list[str]:

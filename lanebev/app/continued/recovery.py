@@ -39,9 +39,7 @@ class RecoveredObserver:
 
     Attributes:
         frames: how many were taken.
-        is_reported: see above.
-        remark: remark of the other observer.
-        workers: likewise.
+        remark, workers: those of the other observer.
     """
 
     def __init__(

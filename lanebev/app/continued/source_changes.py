@@ -48,8 +48,3 @@ def count_remark(source: FrameSource, got: int) -> str:
     if got == min(expected, source.most or expected):
         return ""
     return f"{source.source}: expected {expected} frames by its packets, got {got}; is it damaged?"
-
-
-def source_remarks(source: FrameSource, before: Files, got: int) -> list[str]:
-    """Return remarks on files that changed during a run, and on the number of frames that it got."""
-    return [*filter(None, (changes_remark(source, before), count_remark(source, got)))]
