@@ -196,8 +196,10 @@ def _camera(
         return checked(chosen(cameras, name, has_usual=True))
     if name is not None:
         raise ValueError(f"expected no name after # for a file of one camera, got {shown(name)}")
-    only = next(iter(content.values())) if len(content) == 1 else None
-    if isinstance(only, Mapping) and "data" not in only:  # keys below the camera's name
+    while len(content) == 1:  # keys below the camera's name, or below two as in ROS 2's settings of nodes
+        (only,) = content.values()
+        if not isinstance(only, Mapping) or "data" in only:
+            break
         content = only
     if read := _reader_by_keys(content):
         return checked(read(content))

@@ -921,5 +921,6 @@ def test_four_coefficients_without_a_lens_model_are_remarked_on(tmp_path):
     [{"fx": 500, "fy": 500, "cx": 320, "cy": 240}, {"K": [500, 0, 320, 0, 500, 240, 0, 0, 1], "D": []}],
 )
 def test_keys_below_the_cameras_name_are_read(tmp_path, fields):
-    text = yaml.safe_dump({"front": {**fields, "width": 640, "height": 480}})
-    assert_is(read(tmp_path / "c.yaml", text), 500, 500, 320, 240, 640, 480)
+    camera = {**fields, "width": 640, "height": 480}
+    for below in ({"front": camera}, {"/**": {"ros__parameters": camera}}):
+        assert_is(read(tmp_path / "c.yaml", yaml.safe_dump(below)), 500, 500, 320, 240, 640, 480)

@@ -56,7 +56,8 @@ def endings_remedy(paths: Iterable[Path]) -> str:
     """Return a hint on the source to give instead of files that are no images; empty if there are none."""
     endings = sorted({each.suffix for each in paths if each.is_file() and each.name[0] != "."})
     known = " ".join(IMAGE_SUFFIXES)
-    found = f"its files end with {' '.join(endings[:5])}, images with {known}; give a video itself"
+    ends = f"end with {' '.join(filter(None, endings[:5]))}" if any(endings) else "have no endings"
+    found = f"its files {ends}, images with {known}; give a video itself"
     return found if endings else ""
 
 

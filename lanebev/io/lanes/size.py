@@ -7,10 +7,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from lanebev.camera.parameters import are_swapped
 from lanebev.io.lanes.parsing import FrameLines
 from lanebev.observation.polylines import without_edges
 
 _STATE_SIZE = "state their size with --lanes-size WIDTHxHEIGHT"
+_IF_TURNED = "if images are turned by their EXIF orientation, draw lanes on the turned ones"
 _OUTSIDE = 0.1  # share of points below or far beside the images, of which more are of another size
 _OFF_CENTRE = 0.2  # share of a side, more than a principal point is off the centre
 _BESIDE = 0.5  # image widths beside an image that lines are drawn on to
@@ -80,6 +82,11 @@ def lanes_of_whole_images(
     drawn_on = size or (height, width)
     if doubt := _doubt_of_size(frames, drawn_on):
         raise ValueError(f"lanes, by --lanes-size and --lanes-crop: {doubt.words} leave out what is wrong")
+    if are_swapped(drawn_on, (height, width)):
+        raise ValueError(
+            f"lanes size: expected WIDTHxHEIGHT of images like those of {width} x {height} px, got "
+            f"{drawn_on[1]} x {drawn_on[0]}; {_IF_TURNED}"
+        )
     resized = resized_lanes(frames, drawn_on, (height, width))
     return [_moved(frame, np.ones(2), np.array([left, top], dtype=np.float64)) for frame in resized]
 
@@ -134,9 +141,10 @@ def _doubt_of_size(frames: Sequence[FrameLines], image_size: tuple[int, int]) ->
     if not others or others[0] is None:
         return None
     (height, width), (rows, columns) = image_size, others[0]
+    is_turned = are_swapped(others[0], image_size)
     return SizeDoubt(
         f"expected lanes of images of {width} x {height} px, got {columns} x {rows} in the file;",
-        _STATE_SIZE.replace("WIDTHxHEIGHT", f"{columns}x{rows}"),
+        _IF_TURNED if is_turned else _STATE_SIZE.replace("WIDTHxHEIGHT", f"{columns}x{rows}"),
         is_outside=True,
     )
 

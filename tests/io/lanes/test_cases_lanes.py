@@ -385,6 +385,20 @@ def test_lanes_of_a_stated_part_are_moved_to_their_place(size):
             lanes_of_whole_images(drawn, size, other, (720, 1280))
 
 
+def test_lanes_of_images_that_were_not_turned_are_refused():  # labelme#1873
+    """A stretch to the other proportions would bring them into the images, to wrong places."""
+    stated = [entry._replace(image_size=(1280, 720)) for entry in _entries()]
+    words = "got 720 x 1280.*; if images are turned by their EXIF orientation, draw lanes on the turned ones"
+    with pytest.raises(ValueError, match=f"lanes: expected lanes of images of 1280 x 720 px, {words}"):
+        size_remark(stated, (720, 1280))
+    for size in ((1280, 720), (640, 360)):
+        with pytest.raises(
+            ValueError, match="lanes size: expected WIDTHxHEIGHT of images like those of 1280 x"
+        ):
+            lanes_of_whole_images(_entries(), size, None, (720, 1280))
+    lanes_of_whole_images(_entries(), (512, 512), None, (720, 1280))
+
+
 @pytest.mark.parametrize("text", ["1280x480", "1280x480+0", "1280+0+240", "1280x480+0-240", "0x480+0+0", ""])
 def test_crops_that_are_none_are_one_clear_line(text):
     with pytest.raises(ValueError, match=r"lanes crop: expected WIDTHxHEIGHT\+LEFT\+TOP"):

@@ -391,6 +391,9 @@ def test_folder_without_images_suggests_a_glob(tmp_path):
     _folder(tmp_path, ["a/1.png"])
     with pytest.raises(ValueError, match=r"quoted glob such as '.*/\*\*/\*\.jpg'"):
         open_source(str(tmp_path))
+    (tmp_path / "0001").touch()
+    with pytest.raises(ValueError, match=r"its files have no endings, images with \.jpg"):
+        open_source(str(tmp_path))
 
 
 def test_write_png(tmp_path):
