@@ -1,12 +1,10 @@
 """The kinds of road that a world shows, drawn independently, so that kinds combine."""
 
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple
 
 from torch import Tensor
 
 from lanebev.render.scene.sampler import BatchSampler
-
-T = TypeVar("T", bound=tuple[Any, ...])
 
 KINDS = ("any", "highway", "varied", "city", "country", "night", "snow", "tunnel", "works", "camera")
 _VARIED = 0.43  # share of the worlds of "any" that are not the plain highway
