@@ -56,7 +56,7 @@ def _tensors(values: Any) -> list[torch.Tensor]:
 
 
 def _is_view(func: Callable[..., Any], args: Any, result: Any) -> bool:
-    """Tell whether a result is memory of an argument that the function did not write."""
+    """Return whether a result is memory of an argument that the function did not write."""
     name = func.__name__
     writes = name.endswith("_") and not name.endswith("__")
     given = {tensor.untyped_storage().data_ptr() for tensor in _tensors(args)}

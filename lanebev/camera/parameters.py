@@ -36,7 +36,7 @@ class CameraParameters(NamedTuple):
 
 
 def are_swapped(size: tuple[int, int], like: tuple[int, int]) -> bool:
-    """Tell whether a size has the proportions of another one only if its sides are swapped."""
+    """Return whether a size has the proportions of another one only if its sides are swapped."""
     (height, width), (rows, columns) = size, like
     stated, swapped = (rows * width) / (columns * height), (rows * height) / (columns * width)
     return not 1 / _SAME_SHAPE < stated < _SAME_SHAPE and 1 / _SAME_SHAPE < swapped < _SAME_SHAPE

@@ -34,7 +34,7 @@ class Difference(NamedTuple):
     problem: str | None = None
 
     def within(self, tolerance: float) -> bool:
-        """Tell whether all words are the same and no number differs by more than so many sigmas."""
+        """Return whether all words are the same and no number differs by more than so many sigmas."""
         largest = max(self.sigmas.values(), default=0.0)
         return self.problem is None and not any(self.words.values()) and largest <= tolerance
 
@@ -151,5 +151,5 @@ def _apart(new: str, old: str, sigma: float) -> float:
 
 
 def _about_same(new: str, old: str) -> bool:
-    """Tell whether two means agree to a hundredth of a pixel."""
+    """Return whether two means agree to a hundredth of a pixel."""
     return abs(float(new) - float(old)) < 0.01

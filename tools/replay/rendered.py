@@ -48,7 +48,7 @@ class Shock(NamedTuple):
     last: float
 
     def during(self, times: torch.Tensor) -> torch.Tensor:
-        """Tell which times (T,) s are in it, (T,) bool."""
+        """Return which times (T,) s are in it, (T,) bool."""
         return (times >= self.first) & (times < self.last)
 
 

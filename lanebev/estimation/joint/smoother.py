@@ -69,12 +69,12 @@ def link_states(before: JointState, after: JointState, dt: Tensor, cfg: JointCon
 
 
 def _alike(chosen: Tensor) -> Tensor:
-    """Tell of which pairs (D, D) both entries or neither are chosen (D,)."""
+    """Return of which pairs (D, D) both entries or neither are chosen (D,)."""
     return chosen.unsqueeze(-1) == chosen
 
 
 def other_quantities(after: JointState, cfg: JointConfig) -> Tensor:
-    """Tell which entries (B, D) of a state are not the same quantity as in the state of the frame before."""
+    """Return which entries (B, D) of a state are another quantity than in the state of the frame before."""
     indices = layout(cfg.num_boundaries)
     numbered = (OFFSET, *range(indices.size)[indices.deviations])
     of_numbers = torch.tensor([k in numbered for k in range(indices.size)], device=after.mean.device)

@@ -69,6 +69,6 @@ class JointState(NamedTuple):
 
 
 def unobserved_mask(reasons: Tensor) -> Tensor:
-    """Tell what of pitch, yaw, roll and height the last frame did not determine, (B, 4) bool."""
+    """Return which of pitch, yaw, roll and height the last frame did not determine, (B, 4) bool."""
     bits = (Reason.DIRECTION_UNSEEN, Reason.DIRECTION_UNSEEN, Reason.ROLL_UNSEEN, Reason.HEIGHT_UNSEEN)
     return (reasons.unsqueeze(-1) & constant(tuple(map(int, bits)), like=reasons)) != 0

@@ -153,7 +153,7 @@ def is_contrary(
     seen: Observations,
     cfg: JointConfig,
 ) -> Tensor:
-    """Tell whether a frame contradicts the state: its own fit differs significantly, and is not less likely.
+    """Return whether a frame contradicts the state: its own fit differs significantly, and fits no worse.
 
     Source: (J19).
 

@@ -36,7 +36,7 @@ _BY_HEADINGS = (False, True)  # columns of M: by deviations, by headings
 
 
 class Scatter(NamedTuple):
-    """What one frame tells of its boundaries' own deviations and headings.
+    """Information of one frame on its boundaries' own deviations and headings.
 
     Attributes:
         sensitivity: (B, 4, 2 L), change of the pose by the boundaries' own deviations (per m), then by their
@@ -204,7 +204,7 @@ def start_variance(moments: Tensor, heading_std: float) -> Tensor:
 
 
 def determined_sensitivity(determined: Tensor, num_boundaries: int) -> Tensor:
-    """Tell which entries of the sensitivity a frame by itself determines, (B, 4, 2 L) bool.
+    """Return which entries of the sensitivity a frame by itself determines, (B, 4, 2 L) bool.
 
     All if it determines the whole pose. If it determines all but the roll, as with two boundaries in view,
     those of the other parameters and the headings.

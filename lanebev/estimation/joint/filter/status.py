@@ -71,7 +71,7 @@ def update_track_status(
 
 
 def is_supported(predicted: JointState, update: FrameUpdate, seen: Observations, cfg: JointConfig) -> Tensor:
-    """Tell in which rows (B,) enough of a frame's segments fit the state; more must fit after a loss."""
+    """Return in which rows (B,) enough of a frame's segments fit the state; more must fit after a loss."""
     updated = update.state
     support, total = (seen.weight * update.trust).sum(-1), seen.weight.sum(-1)
     share = support / total.clamp(min=1e-6)

@@ -63,7 +63,7 @@ class Step(NamedTuple):
 
 
 def membership(boundary: Tensor, num_boundaries: int, like: Tensor) -> Tensor:
-    """Tell which end points are on which boundary, (B, L, M) of 1 and 0, by those of the segments (B, N)."""
+    """Return which end points are on which boundary, (B, L, M) of 1 and 0, from that of segments (B, N)."""
     numbers = torch.arange(num_boundaries, device=boundary.device).unsqueeze(-1)
     return per_end((boundary.unsqueeze(1) == numbers).to(like.dtype))
 

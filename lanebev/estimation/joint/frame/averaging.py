@@ -157,7 +157,7 @@ def fit_all_readings(
 def _agrees_with_average(
     start: Tensor, mean: Tensor, centre: Tensor, spread: Tensor, prior: FramePrior
 ) -> Tensor:
-    """Tell where the pose of the likeliest reading (B, 7) is as good as the average, (B,) bool.
+    """Return where the pose of the likeliest reading (B, 7) is as good as the average, (B,) bool.
 
     It is near the average by the tempered evidence, whose mean and covariance are ``centre`` and ``spread``,
     and its pitch and roll are not farther from the prior than those of ``mean`` are.
