@@ -7,12 +7,13 @@ import torch
 from torch import Tensor
 
 from lanebev.batch import readable
-from lanebev.camera.parameters import are_swapped
+from lanebev.camera.parameters import OFF_CENTRE, are_swapped
 from lanebev.geometry.lens import check_distortion, check_intrinsics, last_row_is_small
 from lanebev.tensors import constant
 from lanebev.types import Extrinsics, check_devices, check_extrinsics, check_tensor
 
 _CORNERS = (0.3, 0.9)  # fractions of width and height below or beyond which a principal point is doubted
+_MIDDLE = 0.1  # fraction of a side, less than which from the centre a principal point is in the middle
 _BESIDE = -1e6  # px, place of every point in the image of a camera that cannot be used
 
 
@@ -126,7 +127,8 @@ def doubt_intrinsics(intrinsics: Tensor, size: tuple[int, int]) -> None:
     """Warn if the principal points are at the upper left or lower right corner of images, or beyond.
 
     Such intrinsics are those of an image before it was resized, or of the image that a feature map covers,
-    fractions of the sides, or inverted. Where reading numbers would wait for a device, there is no warning.
+    fractions of the sides, or inverted. Warn too if they are in the middle of images with swapped sides.
+    Where reading numbers would wait for a device, there is no warning.
 
     Args:
         intrinsics: (..., 3, 3) px.
@@ -148,3 +150,16 @@ def doubt_intrinsics(intrinsics: Tensor, size: tuple[int, int]) -> None:
                 "give image_size=(H, W) of the image",
                 stacklevel=2,
             )
+    if bool(
+        _are_off(x / width, y / height, OFF_CENTRE).all() & ~_are_off(x / height, y / width, _MIDDLE).any()
+    ):
+        warnings.warn(
+            f"intrinsics: expected those of images of (height, width) {size}, got a principal point in the "
+            "middle of images with swapped sides; give (B, C, H, W), and turn the camera as the image",
+            stacklevel=2,
+        )
+
+
+def _are_off(x: Tensor, y: Tensor, least: float) -> Tensor:
+    """Return whether places in shares of the sides are further than that from the middle."""
+    return torch.maximum((x - 0.5).abs(), (y - 0.5).abs()) > least

@@ -337,6 +337,14 @@ def test_an_interval_that_is_no_number(model):
         model(IMAGE, SMALL_K, dt=None)
 
 
+def test_images_with_swapped_sides_are_doubted(model):
+    with pytest.warns(UserWarning, match=r"middle of images with swapped sides; give \(B, C, H, W\)"):
+        model(torch.rand(1, 3, 96, 64), SMALL_K)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        model(torch.rand(1, 3, 64, 96), SMALL_K)
+
+
 @pytest.mark.parametrize("dt", [33, torch.tensor([33.0])])
 def test_milliseconds_are_doubted(model, dt):
     _, state = model(IMAGE, SMALL_K)

@@ -50,7 +50,10 @@ def read_image(path: str | Path) -> NDArray[np.uint8]:
     except _UNREADABLE as error:
         if isinstance(error, UnidentifiedImageError):
             with open(path, "rb") as file:
-                reason = stand_in(file.read(100)) or "no image or one whose header is cut"
+                reason = (
+                    stand_in(file.read(100))
+                    or "no image, one whose header is cut, or other pixels than of 8 or 16 bits"
+                )
         else:
             reason = " ".join((getattr(error, "strerror", None) or str(error)).split()).lower()[:100]
             reason = reason or type(error).__name__

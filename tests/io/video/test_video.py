@@ -307,7 +307,7 @@ LFS = b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 12345\
         ("i.jpg", LFS, "got: a pointer of Git LFS; fetch the file by git lfs pull"),
         ("i.png", b"\x89PNG\r\n\x1a\n", "expected a whole image, got"),
         ("i.jpg", b"", "expected a whole image, got: an empty file"),
-        ("i.jpg", b"none", "no image or one whose header is cut"),
+        ("i.jpg", b"none", "no image, one whose header is cut, or other pixels"),
         ("*.jpg", None, "expected images that match, got none"),
     ],
 )
