@@ -280,7 +280,8 @@ class LaneBEV(BoundaryDetector):
         with self._gradients("calibrator"):
             calibration, state = self.calibrator(segments, intrinsics, state, dt, lane_width)
             if isinstance(self.calibrator, Calibrator):
-                calibration = self.calibrator.scale_drive(calibration, state, self.pose_sigma_scale)
+                factor = self.pose_sigma_scale
+                calibration = self.calibrator.scale_drive(calibration, state, factor, lane_width)
             else:
                 calibration = calibration.with_std_scaled(self.pose_sigma_scale)
             if speed is not None:

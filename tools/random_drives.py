@@ -32,6 +32,7 @@ WINDING = "winding road at 3 to 12 m/s"
 TURN = "turn of R 15 to 60 m at 4 to 10 m/s"
 CREST = "crest or dip, R 5 to 20 km"
 HILLS = "crests and dips in turn"
+CROWN = "crown, both sides fall by 1 to 3 %"
 CROSSFALL = "crossfall changes by 2 to 6 %"
 
 
@@ -157,6 +158,27 @@ def _crossfall(seed: int) -> Generated:
     return _drawn(seed, change)
 
 
+def _crown(seed: int) -> Generated:
+    """Drive beside a crown, a line of the ego lane from which both sides fall by 1 to 3 %.
+
+    Three to five boundaries are in view. A straight line that is lower by d appears as one of the ego lane's
+    plane that is nearer to the camera by the factor h / (h + d).
+    """
+    random = Random(seed)
+    fall, crown = random.uniform(0.01, 0.03), random.choice((2, 3))
+    visible = random.choice(((1, 2, 3), (1, 2, 3, 4), (0, 1, 2, 3), (0, 1, 2, 3, 4)))
+    if crown == 3:
+        visible = tuple(5 - number for number in reversed(visible))
+    away = (PLACES - PLACES[crown]) * (1 if crown == 3 else -1)
+
+    def change(t: float, moment: Moment) -> Moment:
+        lower = 2 * fall * away.clamp(min=0.0)
+        seen = (PLACES + moment.offset) * moment.pose[3] / (moment.pose[3] + lower) - moment.offset
+        return replace(moment, places=seen, visible=visible)
+
+    return _drawn(seed, change)
+
+
 def _unequal(seed: int, std: float) -> Generated:
     """Put every boundary out of its place for good, independently, by a normal deviate."""
     random = Random(seed)
@@ -253,6 +275,7 @@ KINDS: dict[str, Callable[[int], Generated]] = {
     CREST: _crest,
     HILLS: _hills,
     CROSSFALL: _crossfall,
+    CROWN: _crown,
     "lanes unequal by 2 cm": partial(_unequal, std=0.02),
     "lanes unequal by 10 cm": partial(_unequal, std=0.1),
     **{

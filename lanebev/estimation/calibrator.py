@@ -190,13 +190,16 @@ class Calibrator(nn.Module, Generic[StateT]):
         """
         return calibration.with_std_scaled(factor)
 
-    def scale_drive(self, calibration: Calibration, state: StateT, factor: float) -> Calibration:
+    def scale_drive(
+        self, calibration: Calibration, state: StateT, factor: float, lane_width: float | Tensor = 3.7
+    ) -> Calibration:
         """Scale the standard deviations of a drive's pose for a detector whose errors repeat over frames.
 
         Args:
             calibration: calibration of a frame.
             state: state after it, before :meth:`with_speed`.
             factor: factor on the standard deviations of what the frames tell of the pose.
+            lane_width: m, as of the frame.
         """
         return calibration.with_std_scaled(factor)
 

@@ -112,16 +112,26 @@ def mask_invalid_rows(
         num_boundaries: L.
     """
     segments = clean_segments(segments, num_boundaries)
-    least, most = LANE_WIDTHS
-    mean = lane_width.mean(-1)
-    likely = (lane_width > 0).all(-1) & (mean >= least) & (mean <= most)  # false on NaN
-    good = usable_cameras(intrinsics) & likely  # (B,)
+    good = usable_cameras(intrinsics) & usable_widths(lane_width)  # (B,)
     weight = torch.where(good.unsqueeze(-1), segments.weight, 0.0)
     return (
         segments._replace(weight=weight),
         torch.where(good[:, None, None], intrinsics, placeholder_intrinsics(intrinsics)),
-        torch.where(good.unsqueeze(-1), lane_width, _HARMLESS_WIDTH),
+        harmless_widths(lane_width, good),
     )
+
+
+def usable_widths(lane_width: Tensor) -> Tensor:
+    """Tell in which rows (B,) bool all lane widths (B, M) m are positive, and their mean is possible."""
+    least, most = LANE_WIDTHS
+    mean = lane_width.mean(-1)
+    usable: Tensor = (lane_width > 0).all(-1) & (mean >= least) & (mean <= most)  # false on NaN
+    return usable
+
+
+def harmless_widths(lane_width: Tensor, good: Tensor) -> Tensor:
+    """Replace the lane widths (B, M) m of rows that are not good, (B,) bool."""
+    return torch.where(good.unsqueeze(-1), lane_width, _HARMLESS_WIDTH)
 
 
 def padded(segments: LaneSegments, least: int = LEAST_SEGMENTS) -> LaneSegments:

@@ -81,7 +81,7 @@ class Tracker(Generic[StateT]):
         segments = camera_segments(vertices, self.camera)
         intrinsics = self.camera.intrinsics[None]
         calibration, self.state = self.calibrator(segments, intrinsics, self.state, dt, self.lane_width)
-        calibration = self.calibrator.scale_drive(calibration, self.state, pose_sigma_scale)
+        calibration = self.calibrator.scale_drive(calibration, self.state, pose_sigma_scale, self.lane_width)
         if speed is not None:
             self.state = self.calibrator.with_speed(self.state, speed)
         self.own_covariance = calibration.covariance

@@ -16,7 +16,8 @@ from lanebev.estimation.joint.measurement.residuals import HEIGHT, NUM_SHAPE, OF
 from lanebev.estimation.joint.output import (
     as_calibration,
     beyond_filter,
-    learned_deviation,
+    deviation_by_break,
+    learned_road,
     single_deviation,
     unverified_deviation,
 )
@@ -24,8 +25,12 @@ from lanebev.estimation.reasons import Reason
 from lanebev.testing.moments import PLACES, WIDTH, moments
 from lanebev.testing.moments import observe as see
 from tests.estimation.joint_drives import DOUBLE, drive, fitted_frame, follow, nothing, run
+from tools.bench_kinds import drawn, figures_of
+from tools.random_drives import CROWN
 
 torch.set_num_threads(1)
+
+PLANE = JointConfig(crossfall_break_std=0.0)
 
 
 def test_doubt_about_lanes_outlasts_frames_that_show_nothing():
@@ -105,6 +110,11 @@ def information_on(deviations, std, visible=(0, 1, 2, 3, 4, 5)):
     return torch.cat([matrix.expand(len(deviations), 6, 6), vector], dim=-1)
 
 
+def learned_deviation(places, deviations, cfg=PLANE):
+    """On a road that is plane across."""
+    return learned_road(places, deviations, by_break().expand(len(places), 4, 6), cfg).deviation
+
+
 def test_the_size_of_deviations_is_learned_from_the_difference_that_four_boundaries_show():
     """Against the densities of that difference, a normal deviate of each possible size and its noise."""
     noise, visible = 0.002, (1, 2, 3, 4)
@@ -117,11 +127,12 @@ def test_the_size_of_deviations_is_learned_from_the_difference_that_four_boundar
     density = (-0.5 * (shown.unsqueeze(-1) / spread).square()).exp() / spread
     share = density * torch.tensor([0.957, 0.03, 0.01, 0.003], dtype=DOUBLE)
     expected = (share * sizes.square()).sum(-1) / share.sum(-1)
-    found = learned_deviation(places, none, JointConfig())
+    found = learned_deviation(places, none)
     torch.testing.assert_close(found, expected)
     assert found[0].sqrt() < 0.012
     assert (found.diff() > 0).all()
-    assert (learned_deviation(places, none, JointConfig(lane_deviation_std=0.0)) == 0).all()
+    equal = JointConfig(lane_deviation_std=0.0, crossfall_break_std=0.0)
+    assert (learned_deviation(places, none, equal) == 0).all()
 
 
 def test_a_line_that_bounds_no_lane_tells_nothing_of_the_lanes():
@@ -129,9 +140,63 @@ def test_a_line_that_bounds_no_lane_tells_nothing_of_the_lanes():
     deviations = 0.03 * torch.randn(20, 6, generator=generator, dtype=DOUBLE)
     without = information_on(deviations, 0.002, (0, 1, 2, 3))
     deviations[:, 4] = -0.9
-    found = learned_deviation(information_on(deviations, 0.002, (0, 1, 2, 3, 4)), deviations, JointConfig())
-    expected = learned_deviation(without, 0 * deviations, JointConfig())
+    found = learned_deviation(information_on(deviations, 0.002, (0, 1, 2, 3, 4)), deviations)
+    expected = learned_deviation(without, 0 * deviations)
     torch.testing.assert_close(found, expected, rtol=0.05, atol=1e-6)
+
+
+def by_break():
+    """Deviations (1, 4, 6) by changes of the crossfall, seen from 0.3 m left of the lane's middle."""
+    state = JointCalibrator().initial_state(1, DOUBLE)
+    state.mean[:, OFFSET], state.mean[:, HEIGHT] = 0.3, 1.5
+    return deviation_by_break(PLACES[None], state)
+
+
+def test_a_line_beyond_a_change_of_the_crossfall_is_seen_nearer_or_farther_aside():
+    at, change = PLACES + 0.3, 1e-6
+    for k, side in ((1, -1), (2, -1), (3, 1), (4, 1)):
+        lower = change * (side * (at - at[k])).clamp(min=0.0)
+        expected = (at * 1.5 / (1.5 + lower) - at) / change
+        torch.testing.assert_close(by_break()[0, k - 1], expected, rtol=1e-5, atol=1e-5)
+
+
+def test_what_frames_tell_of_the_crossfall_is_the_average_over_where_it_may_change():
+    """Against the densities of the vector of information, normal with the covariance of each possibility."""
+    cfg, around = JointConfig(), by_break()[0]
+    change = torch.tensor([0.0, 0.02, 0.04], dtype=DOUBLE)
+    shown = change.unsqueeze(-1) * around[1] + 0.002 * torch.tensor([0.0, 1.0, -1.0, 1.0, 0.0, 0.0])
+    places = information_on(shown, 0.002, (0, 1, 2, 3, 4))
+    matrix, pull = places[0, :, :-1], places[..., -1]
+    none, one = torch.zeros(3, 6, dtype=DOUBLE), torch.eye(6, dtype=DOUBLE)
+    found = learned_road(places, none, around.expand(3, 4, 6), cfg)
+    kinds = [(size, k) for size in range(4) for k in (None, 0, 1, 2, 3)]
+    logs, squares = [], []
+    for size, k in kinds:
+        own = (0.05 * (0.0, 0.15, 0.6, 2.4)[size]) ** 2 * one
+        spread = own if k is None else own + 0.04**2 * torch.outer(around[k], around[k])
+        share = (0.957, 0.03, 0.01, 0.003)[size] * (0.7 if k is None else (0.05, 0.1, 0.1, 0.05)[k])
+        inverse = torch.linalg.inv(one + matrix @ spread)
+        evidence = 0.5 * ((pull @ spread) * (pull @ inverse.mT)).sum(-1)
+        logs.append(evidence + 0.5 * torch.logdet(inverse) + math.log(share))
+        along = torch.zeros(6, dtype=DOUBLE) if k is None else around[k]
+        mean = 0.04**2 * (pull @ inverse.mT) @ along
+        squares.append(mean.square() + 0.04**2 - 0.04**4 * along @ inverse @ matrix @ along)
+    weights = torch.stack(logs).softmax(0)
+    for k in range(4):
+        here = [number for number, kind in enumerate(kinds) if kind[1] == k]
+        expected = sum(weights[number] * squares[number] for number in here)
+        torch.testing.assert_close(found.breaks[:, k], expected, rtol=1e-6, atol=1e-12)
+    assert found.breaks[0, :3].sum().sqrt() < 0.003  # no line in view is beyond the last
+    assert found.breaks[2, 1].sqrt() == pytest.approx(0.04, rel=0.2)
+
+
+def test_a_crown_does_not_make_the_roll_sure_and_wrong():
+    """Lines beyond a crown fit a plane road and another roll, or nearly so."""
+    drives = drawn(CROWN, range(60_000, 60_004))
+    sure, doubting = (
+        figures_of(drives, JointCalibrator(crossfall_break_std=std)).nees for std in (0.0, 0.04)
+    )
+    assert doubting < 0.5 * sure
 
 
 def test_the_lanes_that_were_seen_keep_what_they_showed_under_their_new_numbers():

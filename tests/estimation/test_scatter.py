@@ -74,7 +74,7 @@ def test_the_variances_of_places_and_headings_are_found(place_std, heading_std):
 def test_parallel_boundaries_add_almost_nothing(visible):
     """With noise of 1 px, after half a second."""
     drive = moments(0.6, lambda t, m: replace(m, visible=visible))
-    calibrator = JointCalibrator(lane_deviation_std=0.0, start_heading_std=0.0)
+    calibrator = JointCalibrator(lane_deviation_std=0.0, crossfall_break_std=0.0, start_heading_std=0.0)
     last = follow(drive, calibrator, rows=8, seed=4)[-1]
     added = last.sigma.square() / last.state.cov.diagonal(dim1=1, dim2=2)[:, :4]
     assert (added.median(0).values < 1.15).all()
@@ -391,7 +391,10 @@ def test_a_detectors_factor_is_not_applied_to_the_prior_of_roads(visible, roll):
     less = every.covariance - scaled.covariance
     assert torch.linalg.eigvalsh(less).min() > -1e-15
     of_roll, of_all = (each.covariance[0, ROLL, ROLL].sqrt() for each in (scaled, every))
-    assert of_roll < 0.6 * of_all if len(visible) == 3 else of_roll == of_all
+    if len(visible) == 3:
+        assert of_roll < 0.6 * of_all
+    else:
+        assert of_roll == pytest.approx(float(of_all), rel=5e-3)  # a crown is improbable by now
     assert scaled.covariance[0, PITCH, PITCH] > 0.95 * every.covariance[0, PITCH, PITCH]
     same = CALIBRATOR.scale_drive(out, state, 1.0)
     assert torch.equal(same.covariance, out.covariance)

@@ -12,9 +12,11 @@ from lanebev.estimation.checks import (
     as_batch,
     as_lane_width,
     check_new_state,
+    harmless_widths,
     is_running,
     mask_invalid_rows,
     unused_frame,
+    usable_widths,
 )
 from lanebev.estimation.joint.config import JointConfig
 from lanebev.estimation.joint.filter.iterated_update import update_state
@@ -151,14 +153,19 @@ class JointCalibrator(Calibrator[JointState]):
         scaled = calibration._replace(extrinsics=Extrinsics.unstack(pose), covariance=covariance)
         return cast_floating(scaled, given.dtype)
 
-    def scale_drive(self, calibration: Calibration, state: JointState, factor: float) -> Calibration:
+    def scale_drive(
+        self, calibration: Calibration, state: JointState, factor: float, lane_width: float | Tensor = 3.7
+    ) -> Calibration:
         """Multiply the standard deviations of a drive's pose, except the part for unverified lanes (J36)."""
         if factor == 1:
             return calibration
         given = calibration.covariance
         like = given.to(widest_dtype(given.device))
+        widths = as_lane_width(lane_width, like, self.num_boundaries)
+        positions = boundary_places(harmless_widths(widths, usable_widths(widths)), self.num_boundaries, like)
         with autocast_off(like.device, like.dtype):
-            scaled = scaled_covariance(like, cast_floating(state, like.dtype), self.config, factor)
+            known = cast_floating(state, like.dtype)
+            scaled = scaled_covariance(like, known, positions, self.config, factor)
         return cast_floating(calibration._replace(covariance=scaled), given.dtype)
 
     def curvature(self, state: JointState) -> Tensor:

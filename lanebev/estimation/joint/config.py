@@ -125,6 +125,8 @@ class JointConfig:
             that boundaries are parallel; its variance decays over twice ``scatter_memory``.
         lane_deviation_std: sigma of a boundary's deviation where too few are in view to tell whether lanes
             are equal, m; 0: lanes are equal.
+        crossfall_break_std: standard deviation of the change of the crossfall at a boundary, as at the crown
+            of a road with two directions, where there is one; 0: the road is plane across.
         no_boundary_odds: prior odds that one of three lines in view bounds no lane; 0: each does.
         motion: motion model.
         prior: prior of a start and range of its search.
@@ -149,6 +151,7 @@ class JointConfig:
     scatter_memory: float = 1.0
     start_heading_std: float = 0.003
     lane_deviation_std: float = 0.05
+    crossfall_break_std: float = 0.04
     no_boundary_odds: float = 0.25
     motion: MotionConfig = field(default_factory=MotionConfig)
     prior: FramePrior = field(default_factory=FramePrior)

@@ -1,6 +1,7 @@
 """The calibration that is given out: the pose, and its covariance with what the filter does not estimate."""
 
 import math
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -23,6 +24,7 @@ _ONLY_HEIGHT = (0.0, 0.0, 0.0, 1.0)
 _ALWAYS_FIT = 3  # boundaries: some pose over equal lanes fits any three
 _SCALES = (0.0, 0.15, 0.6, 2.4)  # possible sigmas of deviations, ratios to ``lane_deviation_std``
 _SHARES = (0.957, 0.03, 0.01, 0.003)  # their prior probabilities
+_EGO_BREAK, _OTHER_BREAK = 0.1, 0.05  # prior probability of a change of the crossfall at a boundary
 _MISFIT_FACTOR = 4.0  # the odds that a line bounds no lane are so much larger where other lines do not fit
 _EGO_LANE_SHARE = 0.2  # such a line's variance on the ego lane's boundaries, relative to that on the others
 _NO_BOUNDARY_RANGE = 3.6  # m; the position of such a line is uniform over it
@@ -59,7 +61,7 @@ def unverified_deviation(
     """Compute the variance (B, L) m² of each boundary's deviation where too few are in view to tell.
 
     Source: (J26). Three boundaries fit a pose of equal lanes, however unequal the lanes are; a fourth shows
-    whether they are (:func:`learned_deviation`), unless it deviates so much that it bounds no lane.
+    whether they are (:func:`learned_road`), unless it deviates so much that it bounds no lane.
 
     Args:
         sensitivity: (B, 4, L) change of the pose per metre of deviation of a boundary; 0 if not in view.
@@ -81,28 +83,82 @@ def unverified_deviation(
     return of_any.unsqueeze(-1) + odd * of_three.unsqueeze(-1)
 
 
-def learned_deviation(places: Tensor, deviations: Tensor, cfg: JointConfig) -> Tensor:
-    """Compute the expected square (B,) m² of a boundary's deviation by what the frames so far tell of them.
+class LearnedRoad(NamedTuple):
+    """What the frames so far tell of how far the road is from a plane with equal lanes.
 
-    Source: (J35), Bayesian model averaging over the standard deviation of the deviations.
+    Attributes:
+        deviation: (B,) m², expected square of a boundary's deviation.
+        breaks: (B, L - 2), expected square of the change of the crossfall at each inner boundary.
+    """
+
+    deviation: Tensor
+    breaks: Tensor
+
+
+def learned_road(places: Tensor, deviations: Tensor, by_break: Tensor, cfg: JointConfig) -> LearnedRoad:
+    """Compute what the frames so far tell of deviations, and of a change of the crossfall.
+
+    Source: (J35), Bayesian model averaging over the standard deviation of the deviations and the boundary at
+    which the crossfall changes, if it does.
 
     Args:
         places: (B, L, L + 1), information on the deviations, matrix and vector.
         deviations: (B, L) m, by the filter; a boundary that bounds no lane tells nothing.
+        by_break: (B, L - 2, L) m of :func:`deviation_by_break`.
         cfg: the configuration.
     """
     variances = constant(tuple((scale * cfg.lane_deviation_std) ** 2 for scale in _SCALES), like=places)
     free = torch.where(deviations.abs() < _LARGEST_DEVIATION, 0.0, 1.0)  # m²
     stds = (variances[:, None, None] + free).sqrt()  # (S, B, L)
-    matrix = stds.unsqueeze(-1) * places[..., :-1] * stds.unsqueeze(-2)
+    known, pull = places[..., :-1], places[..., -1:]
+    matrix = stds.unsqueeze(-1) * known * stds.unsqueeze(-2)
     one = identity(places.shape[-2], places.dtype, places.device)
     spoiled = ~(cholesky(matrix + one).diagonal(dim1=-2, dim2=-1) > 0).all(-1)
     rounding = _ROUNDING * matrix.diagonal(dim1=-2, dim2=-1).sum(-1) * spoiled
     factor = cholesky(matrix + (1 + rounding)[..., None, None] * one)
-    white = solve_lower(factor, (stds * places[..., -1]).unsqueeze(-1))
-    evidence = 0.5 * white.square().sum((-2, -1)) - factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
-    weights = (evidence + constant(tuple(map(math.log, _SHARES)), like=places).unsqueeze(-1)).softmax(0)
-    return (weights * variances.unsqueeze(-1)).sum(0)
+    size = cfg.crossfall_break_std * by_break.mT  # (B, L, K), deviations by a break of one sigma
+    white = solve_lower(factor, stds.unsqueeze(-1) * torch.cat([pull, known @ size], dim=-1))
+    plane, bent = white[..., :1], white[..., 1:]  # (S, B, L, 1), (S, B, L, K)
+    evidence = 0.5 * plane.square().sum((-2, -1)) - factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+    inverse = (
+        1 + (size * (known @ size)).sum(-2) - bent.square().sum(-2)
+    )  # (S, B, K), of the break's variance
+    variance = inverse.clamp(min=1.0).reciprocal()
+    found = variance * ((size * pull).sum(-2) - (bent * plane).sum(-2))  # sigmas
+    of_break = 0.5 * (found.square() / variance + variance.log())
+    straight, broken = _break_shares(by_break.shape[1])
+    evidence = evidence.unsqueeze(-1) + torch.cat([torch.zeros_like(of_break[..., :1]), of_break], dim=-1)
+    prior = constant(tuple(map(math.log, _SHARES)), like=places)[:, None, None]
+    prior = prior + constant(tuple(map(math.log, (straight, *broken))), like=places)
+    weights = (evidence + prior).transpose(0, 1).flatten(1).softmax(-1).unflatten(-1, (len(_SCALES), -1))
+    expected = cfg.crossfall_break_std**2 * (found.square() + variance).transpose(0, 1)
+    return LearnedRoad((weights.sum(-1) * variances).sum(-1), (weights[..., 1:] * expected).sum(1))
+
+
+def _break_shares(count: int) -> tuple[float, tuple[float, ...]]:
+    """Return the prior probability that the crossfall changes nowhere, and at each inner boundary."""
+    ego = (count // 2 - 1, count // 2)
+    broken = tuple(_EGO_BREAK if k in ego else _OTHER_BREAK for k in range(count))
+    return 1 - sum(broken), broken
+
+
+def deviation_by_break(positions: Tensor, state: JointState) -> Tensor:
+    """Compute the deviations (B, L - 2, L) m of the boundaries by a change of the crossfall at an inner one.
+
+    Source: (J35). Beyond boundary k, seen from the ego lane, the road is lower by the change of the crossfall
+    times the distance from k. A point that is lower by d at the lateral position X is seen where one of the
+    plane is at X (1 - d / h).
+
+    Args:
+        positions: (B, L) m, of the boundaries from the ego lane's middle.
+        state: (B, ...).
+    """
+    at = positions + state.mean[:, OFFSET, None]
+    count = at.shape[-1]
+    side = constant((*[-1.0] * (count // 2 - 1), *[1.0] * (count // 2 - 1)), like=at).unsqueeze(-1)
+    beyond = (side * (at.unsqueeze(1) - at[:, 1:-1, None])).clamp(min=0.0)
+    height = state.mean[:, HEIGHT].clamp(min=_LEAST_HEIGHT)
+    return -at.unsqueeze(1) * beyond / height[:, None, None]
 
 
 def no_boundary_deviation(by_place: Tensor, roll: Tensor, misfit: Tensor, cfg: JointConfig) -> Tensor:
@@ -192,13 +248,14 @@ def heading_variance(state: JointState, of_scatter: Tensor, of_two: Tensor, cfg:
     return of_two + torch.where(more_than_two, of_more, 0.0)
 
 
-def place_variances(state: JointState, cfg: JointConfig) -> tuple[Tensor, Tensor]:
+def place_variances(state: JointState, learned: Tensor, cfg: JointConfig) -> tuple[Tensor, Tensor]:
     """Compute the variances (B, L) m² of the boundaries' deviations that the filter's covariance lacks.
 
     Source: (J26), (J28), (J35).
 
     Args:
         state: (B, ...).
+        learned: (B,) m², of :func:`learned_road`.
         cfg: the configuration.
 
     Returns:
@@ -208,56 +265,74 @@ def place_variances(state: JointState, cfg: JointConfig) -> tuple[Tensor, Tensor
     own = layout(cfg.num_boundaries).deviations
     deviations, variances = state.mean[:, own], state.cov.diagonal(dim1=1, dim2=2)[:, own]
     of_places, of_headings = scatter_variance(state.scatter).unbind(-1)
-    shown = single_deviation(deviations, cfg).maximum(learned_deviation(state.places, deviations, cfg))
+    shown = single_deviation(deviations, cfg).maximum(learned)
     shown = of_places.unsqueeze(-1).maximum(beyond_filter(shown.unsqueeze(-1), variances))
     roll = state.mean[:, ROLL]
     unverified = unverified_deviation(state.pose_sensitivity, deviations, of_headings, roll, cfg)
     return shown.expand_as(unverified), beyond_filter(unverified, variances)
 
 
-def covariance_by_boundaries(state: JointState, of_two: Tensor, cfg: JointConfig) -> Tensor:
+def covariance_by_boundaries(
+    state: JointState, positions: Tensor, of_two: Tensor, cfg: JointConfig
+) -> Tensor:
     """Compute the covariance (B, 4, 4) of the pose by the boundaries' own deviations and headings.
 
-    Source: (J26) and (J29).
+    Source: (J26), (J29) and (J35).
 
     Args:
         state: (B, ...).
+        positions: (B, L) m, of the boundaries from the ego lane's middle.
         of_two: (B,) rad² of :func:`wander_of_two`.
         cfg: the configuration.
     """
-    of_places = torch.maximum(*place_variances(state, cfg))
+    road, by_breaks = road_of(state, positions, cfg)
+    of_places = torch.maximum(*place_variances(state, road.deviation, cfg))
     of_headings = heading_variance(state, scatter_variance(state.scatter)[:, 1], of_two, cfg)
     by_heading = state.heading_sensitivity[:, POSE]
-    covariance = by_places(state.pose_sensitivity, of_places)
+    covariance = by_places(state.pose_sensitivity, of_places) + by_breaks
     return covariance + of_headings[:, None, None] * torch.bmm(by_heading, by_heading.mT)
 
 
+def road_of(state: JointState, positions: Tensor, cfg: JointConfig) -> tuple[LearnedRoad, Tensor]:
+    """Compute what the frames tell of the road, and the covariance (B, 4, 4) by changes of its crossfall."""
+    by_break = deviation_by_break(positions, state)
+    deviations = state.mean[:, layout(cfg.num_boundaries).deviations]
+    road = learned_road(state.places, deviations, by_break, cfg)
+    return road, by_places(state.pose_sensitivity @ by_break.mT, road.breaks)
+
+
 def by_places(sensitivity: Tensor, variances: Tensor) -> Tensor:
-    """Compute the covariance (B, 4, 4) of the pose by deviations of the boundaries.
+    """Compute the covariance (B, 4, 4) of the pose by independent deviations, or changes of the crossfall.
 
     Args:
-        sensitivity: (B, 4, L), change of the pose per metre.
-        variances: (B, L) m².
+        sensitivity: (B, 4, L), change of the pose by each.
+        variances: (B, L).
     """
     return torch.bmm(variances.unsqueeze(1) * sensitivity, sensitivity.mT)
 
 
-def scaled_covariance(covariance: Tensor, state: JointState, cfg: JointConfig, factor: float) -> Tensor:
+def scaled_covariance(
+    covariance: Tensor, state: JointState, positions: Tensor, cfg: JointConfig, factor: float
+) -> Tensor:
     """Multiply the standard deviations of a drive's pose, except the part for unverified lanes.
 
     Source: (J36). The factor is for errors of a detector. The part that is not multiplied is a prior of
-    roads: with too few boundaries in view, lanes may be unequal or a line may bound no lane.
+    roads: with too few boundaries in view, lanes may be unequal, a line may bound no lane, or the crossfall
+    may change.
 
     Args:
         covariance: (B, 4, 4) of :func:`as_calibration`.
         state: (B, ...), of the same frame.
+        positions: (B, L) m, of the boundaries from the ego lane's middle.
         cfg: the configuration.
         factor: on the standard deviations.
     """
-    shown, unverified = place_variances(state, cfg)
+    road, by_breaks = road_of(state, positions, cfg)
+    shown, unverified = place_variances(state, road.deviation, cfg)
     scaled = torch.maximum(factor**2 * shown, unverified)
     less = factor**2 * torch.maximum(shown, unverified) - scaled
-    return factor**2 * covariance - by_places(state.pose_sensitivity, less)
+    covariance = factor**2 * (covariance - by_breaks) + by_breaks
+    return covariance - by_places(state.pose_sensitivity, less)
 
 
 def height_variance_by_roll(height: Tensor, left: Tensor, right: Tensor, roll_variance: Tensor) -> Tensor:
@@ -298,7 +373,7 @@ def as_calibration(state: JointState, inliers: Tensor, positions: Tensor, cfg: J
     by_wander = 2 * of_two * (_HEADING_LENGTH * height / width).square()
     only_height = constant(_ONLY_HEIGHT, like=cov)
     apart = state.contradiction.unsqueeze(-1)
-    cov = cov + covariance_by_boundaries(state, of_two, cfg) + apart @ apart.mT
+    cov = cov + covariance_by_boundaries(state, positions, of_two, cfg) + apart @ apart.mT
     cov = cov + lane_width_covariance(height, cfg.lane_width_std / width)
     cov = cov + (only_height * (by_roll + by_wander).unsqueeze(-1)).diag_embed()
     return Calibration(Extrinsics.unstack(state.mean[:, POSE]), cov, state.status, inliers)
