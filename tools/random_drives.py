@@ -166,7 +166,8 @@ def _crown(seed: int) -> Generated:
     """
     random = Random(seed)
     fall, crown = random.uniform(0.01, 0.03), random.choice((2, 3))
-    visible = random.choice(((1, 2, 3), (1, 2, 3, 4), (0, 1, 2, 3), (0, 1, 2, 3, 4)))
+    choices: tuple[tuple[int, ...], ...] = ((1, 2, 3), (1, 2, 3, 4), (0, 1, 2, 3), (0, 1, 2, 3, 4))
+    visible = random.choice(choices)
     if crown == 3:
         visible = tuple(5 - number for number in reversed(visible))
     away = (PLACES - PLACES[crown]) * (1 if crown == 3 else -1)
