@@ -174,7 +174,7 @@ def test_what_frames_tell_of_the_crossfall_is_the_average_over_where_it_may_chan
     for size, k in kinds:
         own = (0.05 * (0.0, 0.15, 0.6, 2.4)[size]) ** 2 * one
         spread = own if k is None else own + 0.04**2 * torch.outer(around[k], around[k])
-        share = (0.957, 0.03, 0.01, 0.003)[size] * (0.7 if k is None else (0.05, 0.1, 0.1, 0.05)[k])
+        share = (0.957, 0.03, 0.01, 0.003)[size] * (0.8 if k is None else (0.02, 0.08, 0.08, 0.02)[k])
         inverse = torch.linalg.inv(one + matrix @ spread)
         evidence = 0.5 * ((pull @ spread) * (pull @ inverse.mT)).sum(-1)
         logs.append(evidence + 0.5 * torch.logdet(inverse) + math.log(share))
