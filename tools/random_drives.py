@@ -8,6 +8,7 @@ from random import Random
 from statistics import NormalDist
 
 import torch
+from torch import Tensor
 
 from lanebev.estimation.joint.frame_prior import FramePrior
 from lanebev.testing.moments import FPS, PLACES, Change, Moment, moments
@@ -32,6 +33,7 @@ WINDING = "winding road at 3 to 12 m/s"
 TURN = "turn of R 15 to 60 m at 4 to 10 m/s"
 CREST = "crest or dip, R 5 to 20 km"
 HILLS = "crests and dips in turn"
+NARROWING = "ego lane narrows by 0.4 to 0.8 m, nothing else in view"
 CROWN = "crown, both sides fall by 1 to 3 %"
 CROSSFALL = "crossfall changes by 2 to 6 %"
 
@@ -215,6 +217,27 @@ def _bend(seed: int, radius: float) -> Generated:
     return _drawn(seed, lambda t, moment: replace(moment, near=5.0, far=40.0, curvature=bend(radius)))
 
 
+def _narrowing(seed: int) -> Generated:
+    """Drive at 12 to 30 m/s in a lane whose right line moves in by 0.4 to 0.8 m, within 0, 30 or 60 m."""
+    random = Random(seed)
+    by, length, speed = (
+        random.uniform(0.4, 0.8),
+        random.choice((1e-3, 30.0, 60.0)),
+        random.uniform(12.0, 30.0),
+    )
+    start = random.uniform(4.0, 7.0) * speed
+    moves = (torch.arange(6) > 2).unsqueeze(-1)
+
+    def change(t: float, moment: Moment) -> Moment:
+        def wander(z: Tensor) -> Tensor:
+            return -by * moves * ((z + speed * t - start) / length).clamp(0.0, 1.0)
+
+        return replace(moment, visible=EGO_LANE, near=5.0, far=40.0, speed=speed, wander=wander)
+
+    motion = sinusoids(seed, 1.5, highest_hz=1.2)
+    return Generated("", lambda: moments(3 * FRAMES / FPS, change, motion))
+
+
 def _kerb(seed: int) -> Generated:
     """Leave the ego lane in view; a second later a line joins it, 0.5 to 1.8 m from where a lane ends."""
     random = Random(seed)
@@ -287,6 +310,7 @@ KINDS: dict[str, Callable[[int], Generated]] = {
         for size in sizes
     },
     "a kerb beside the ego lane": _kerb,
+    NARROWING: _narrowing,
     **_STREETS,
     **{f"{kind}, ego lane": partial(_ego_lane_of, kind) for kind in _ALL_LANES | _STREETS},
     **{

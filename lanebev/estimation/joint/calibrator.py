@@ -25,6 +25,7 @@ from lanebev.estimation.joint.filter.restart import restart
 from lanebev.estimation.joint.filter.speed import update_by_speed
 from lanebev.estimation.joint.filter.start import new_state, start_moments
 from lanebev.estimation.joint.filter.status import update_track_status
+from lanebev.estimation.joint.filter.usual_pose import compare_with_usual
 from lanebev.estimation.joint.frame.averaging import weigh_readings
 from lanebev.estimation.joint.frame_prior import temper_frame
 from lanebev.estimation.joint.layout import NUM_COMMON, STEPS, layout
@@ -100,6 +101,7 @@ class JointCalibrator(Calibrator[JointState]):
         update = in_blocks(numbers, partial(update_state, cfg=cfg), predicted, positions, seen, time.dt)
         after, supported = update_track_status(predicted, update, time.dt, seen, cfg)
         after, inliers = restart(after, update.inliers, supported, seen, positions, cfg)
+        after = compare_with_usual(state, after, seen, inliers, time.dt, cfg)
         after = after._replace(reasons=after.reasons | flag(time.guessed, Reason.TIME))
 
         if not may_skip(time.skip):

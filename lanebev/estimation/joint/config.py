@@ -62,6 +62,11 @@ class MotionConfig:
         endless = [name for name in memories if name != "offset_memory"]
         check_settings(self, positive=["bandwidth", *memories], infinite=endless)
 
+    @property
+    def pose_std(self) -> tuple[float, float, float, float]:
+        """Standard deviations of pitch, yaw, roll and height about their slow means."""
+        return self.angle_std, self.angle_std, self.angle_std, self.height_std
+
 
 @dataclass(frozen=True)
 class ReadingConfig:

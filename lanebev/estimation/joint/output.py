@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from lanebev.batch import has_flag
 from lanebev.estimation.joint.config import JointConfig
@@ -355,7 +356,8 @@ def as_calibration(state: JointState, inliers: Tensor, positions: Tensor, cfg: J
 
     Its covariance adds what the filter does not estimate: the common scale of the lane widths (J25); the
     boundaries' own deviations and headings (J29); the difference from the last frame, if it contradicted
-    the state; and, if roll is not observed, the second-order effect of its error on the height (J30).
+    the state; the difference from the usual roll and height, where the frame tells them badly (J37); and, if
+    roll is not observed, the second-order effect of its error on the height (J30).
 
     Args:
         state: (B, ...).
@@ -374,6 +376,7 @@ def as_calibration(state: JointState, inliers: Tensor, positions: Tensor, cfg: J
     only_height = constant(_ONLY_HEIGHT, like=cov)
     apart = state.contradiction.unsqueeze(-1)
     cov = cov + covariance_by_boundaries(state, positions, of_two, cfg) + apart @ apart.mT
-    cov = cov + lane_width_covariance(height, cfg.lane_width_std / width)
+    unusual = pad(state.unusual, (ROLL, 0)).unsqueeze(-1)
+    cov = cov + lane_width_covariance(height, cfg.lane_width_std / width) + unusual @ unusual.mT
     cov = cov + (only_height * (by_roll + by_wander).unsqueeze(-1)).diag_embed()
     return Calibration(Extrinsics.unstack(state.mean[:, POSE]), cov, state.status, inliers)

@@ -38,6 +38,11 @@ class JointState(NamedTuple):
         doubt: (B,) number of further frames to be fitted alone and compared with the state.
         contrary: (B,) number of consecutive usable frames that contradicted the state.
         contradiction: (B, 4) pose of the last of them less that of the state, until a frame agrees.
+        usual: (B, 2, 4) the pose (rad and m) summed over the frames so far, weighted by time, and the sums of
+            the weights, s (J37).
+        turned: (B,) s for which pitch or yaw differed from its mean.
+        unusual: (B, 2) rad and m, by which roll and height differ from their means where the frame tells them
+            badly, else 0.
         status: (B,) int64, values of Status.
         reasons: (B,) int64, :class:`Reason` flags of the last frame; those of what is unseen decide how the
             next prediction moves.
@@ -60,6 +65,9 @@ class JointState(NamedTuple):
     doubt: Tensor
     contrary: Tensor
     contradiction: Tensor
+    usual: Tensor
+    turned: Tensor
+    unusual: Tensor
     status: Tensor
     reasons: Tensor
 

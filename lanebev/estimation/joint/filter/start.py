@@ -67,6 +67,9 @@ def new_state(mean: Tensor, cov: Tensor, status: Status, reasons: Tensor) -> Joi
         doubt=zero(),
         contrary=zero(),
         contradiction=zero(NUM_POSE),
+        usual=zero(2, NUM_POSE),
+        turned=zero(),
+        unusual=zero(2),
         status=torch.full_like(reasons, int(status)),
         reasons=reasons,
     )
@@ -161,7 +164,7 @@ def _by_parameters(num_boundaries: int) -> tuple[tuple[float, ...], ...]:
 @lru_cache(maxsize=16)
 def _start_variances(num_boundaries: int, motion: MotionConfig) -> tuple[float, ...]:
     """Return the variances (D,) of a start beside those of the frame's fit."""
-    swing = (*[motion.angle_std**2] * 3, motion.height_std**2)
+    swing = tuple(std**2 for std in motion.pose_std)
     _, rate, acceleration, jerk = pose_variances(motion.bandwidth)
     return (
         *[0.0] * NUM_STRAIGHT,

@@ -84,7 +84,7 @@ def motion(
         deviation_decay.expand(-1, num),
         vertical_decay,
     ]
-    std = constant((*[cfg.angle_std] * 3, cfg.height_std), like=dt)
+    std = constant(cfg.pose_std, like=dt)
     walk = constant((*[cfg.mean_angle_walk**2] * 3, cfg.mean_height_walk**2), like=dt)
     variance = (spread.pose_scale * std).square()
     deviation_noise = cfg.deviation_walk**2 * step + unequal.square() * (
