@@ -318,8 +318,8 @@ def scaled_covariance(
     """Multiply the standard deviations of a drive's pose, except the part for unverified lanes.
 
     Source: (J36). The factor is for errors of a detector. The part that is not multiplied is a prior of
-    roads: with too few boundaries in view, lanes may be unequal, a line may bound no lane, or the crossfall
-    may change.
+    roads: with too few boundaries in view, lanes may be unequal, a line may bound no lane, the crossfall or
+    the width of the lane may change.
 
     Args:
         covariance: (B, 4, 4) of :func:`as_calibration`.
@@ -332,8 +332,15 @@ def scaled_covariance(
     shown, unverified = place_variances(state, road.deviation, cfg)
     scaled = torch.maximum(factor**2 * shown, unverified)
     less = factor**2 * torch.maximum(shown, unverified) - scaled
-    covariance = factor**2 * (covariance - by_breaks) + by_breaks
+    of_road = by_breaks + unusual_covariance(state)
+    covariance = factor**2 * (covariance - of_road) + of_road
     return covariance - by_places(state.pose_sensitivity, less)
+
+
+def unusual_covariance(state: JointState) -> Tensor:
+    """Compute the covariance (B, 4, 4) by how far doubtful roll and height left their means (J37)."""
+    unusual = pad(state.unusual, (ROLL, 0)).unsqueeze(-1)
+    return unusual @ unusual.mT
 
 
 def height_variance_by_roll(height: Tensor, left: Tensor, right: Tensor, roll_variance: Tensor) -> Tensor:
@@ -376,7 +383,6 @@ def as_calibration(state: JointState, inliers: Tensor, positions: Tensor, cfg: J
     only_height = constant(_ONLY_HEIGHT, like=cov)
     apart = state.contradiction.unsqueeze(-1)
     cov = cov + covariance_by_boundaries(state, positions, of_two, cfg) + apart @ apart.mT
-    unusual = pad(state.unusual, (ROLL, 0)).unsqueeze(-1)
-    cov = cov + lane_width_covariance(height, cfg.lane_width_std / width) + unusual @ unusual.mT
+    cov = cov + lane_width_covariance(height, cfg.lane_width_std / width) + unusual_covariance(state)
     cov = cov + (only_height * (by_roll + by_wander).unsqueeze(-1)).diag_embed()
     return Calibration(Extrinsics.unstack(state.mean[:, POSE]), cov, state.status, inliers)
