@@ -1,7 +1,7 @@
 """YAML whose numbers and dates stay texts, and in which each key is given once."""
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import yaml
@@ -31,6 +31,21 @@ class PlainLoader(yaml.SafeLoader):
 PlainLoader.add_implicit_resolver(
     "tag:yaml.org,2002:null", re.compile(r"^(?:~|null|Null|NULL|)$"), ["~", "n", "N", ""]
 )
+
+
+def plain_documents(text: str, loader: type[PlainLoader]) -> Iterator[Any]:
+    """Yield what each document of a YAML text says.
+
+    Raises:
+        yaml.YAMLError: the text is none.
+        ValueError: a key is given twice, or is none.
+    """
+    reader: Any = loader(text)  # PyYAML types not all of its methods
+    try:
+        while reader.check_data():
+            yield reader.get_data()
+    finally:
+        reader.dispose()
 
 
 def once(pairs: Iterable[tuple[str, Any]]) -> dict[str, Any]:

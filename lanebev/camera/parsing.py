@@ -13,7 +13,7 @@ import yaml
 
 from lanebev.camera.parameters import left_square, matrix_entries
 from lanebev.numbers import finite_numbers, shown
-from lanebev.plain_yaml import PlainLoader, once
+from lanebev.plain_yaml import PlainLoader, once, plain_documents
 
 _LARGEST_YAML = 1_000_000  # characters; PyYAML reads some 100,000 a second
 _MOST_NUMBERS = 1_000  # numbers in one matrix
@@ -101,7 +101,7 @@ def _parse_yaml(text: str) -> list[Any]:
         lines[0] = ""
     found: list[Any] = []
     try:
-        documents = yaml.load_all(_TABS.sub(" ", "\n".join(lines)), Loader=_CameraLoader)
+        documents = plain_documents(_TABS.sub(" ", "\n".join(lines)), _CameraLoader)
         found.extend(itertools.islice((each for each in documents if each is not None), 2))
         return found or [None]  # ros2 topic echo ends with ---
     except (yaml.YAMLError, RecursionError, ValueError) as error:

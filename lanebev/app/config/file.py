@@ -11,7 +11,7 @@ import yaml
 from lanebev.app.config.options import parsed
 from lanebev.app.config.run import RunConfig
 from lanebev.numbers import read_text
-from lanebev.plain_yaml import PlainLoader
+from lanebev.plain_yaml import PlainLoader, plain_documents
 
 _FLAGS = {"true": True, "yes": True, "on": True, "false": False, "no": False, "off": False}
 
@@ -34,10 +34,14 @@ def load_plain_yaml(text: str) -> object:
 
     Raises:
         yaml.YAMLError: the text is none.
-        ValueError: a key is given twice, or is none.
+        ValueError: a key is given twice, or is none, or there is more than one document.
     """
-    loaded: object = yaml.load(text, Loader=_SettingsLoader)
-    return loaded
+    documents: list[object] = list(plain_documents(text, _SettingsLoader))
+    if len(documents) > 1:
+        raise ValueError(
+            f"expected one YAML document, got {len(documents)}; leave out the line --- between them"
+        )
+    return documents[0] if documents else None
 
 
 def read_settings(path: str | Path) -> dict[str, object]:

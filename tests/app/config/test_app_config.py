@@ -129,6 +129,7 @@ def test_settings_are_checked_when_they_are_made(settings, message):
             "lane_width: 3.5\nlane_width: 3.6",
             "expected a YAML file .*, got: expected each key once, got 'lane_width' twice",
         ),
+        ("lane_width: 3\n---\nlane_width: 4\n", "expected a YAML .*, got: expected one YAML document, got 2"),
         ("lane_width: 3.5\nlane-width: 3.6", "lane-width: expected it once, got it with - and with _"),
         ("stills: 1", "stills: expected true or false, got '1'"),
         ("lane_width: true", "lane_width: expected a text or number, got True"),
