@@ -31,6 +31,7 @@ def heights(drive: Recording) -> tuple[torch.Tensor, torch.Tensor]:
 def test_a_lane_that_becomes_narrower_leaves_the_height_in_doubt():
     """The right line moves in by 0.8 m at one place: the height seems to be 0.4 m more."""
     [drive] = drawn(NARROWING, [60_004])
+    drive.segments.weight[7 * SECOND : 7 * SECOND + 3] = 0  # frames without lanes tell nothing new
     error, std = heights(drive)
     narrower = slice(6 * SECOND, 9 * SECOND)
     assert error[narrower].abs().min() > 0.2

@@ -141,7 +141,7 @@ def replay(calibrator: Calibrator[Any], recordings: Sequence[Recording]) -> Repl
         for k in range(len(dt)):
             now = LaneSegments(*(part[k] for part in segments))
             answer, state = calibrator(now, intrinsics, state, dt[k], widths)
-            answer = _scaled(calibrator, answer, state, scale)
+            answer = _scaled(calibrator, answer, state, scale, widths)
             state = calibrator.with_speed(state, speed[k])
             bend = calibrator.curvature(state)
             mounted, mount_state = mount(answer, mount_state, dt[k], curvature=bend)
@@ -157,10 +157,13 @@ def replay(calibrator: Calibrator[Any], recordings: Sequence[Recording]) -> Repl
     )
 
 
-def _scaled(calibrator: Calibrator[Any], answer: Calibration, state: Any, scale: Tensor) -> Calibration:
-    """Scale the standard deviations of every row by its factor (R,)."""
+def _scaled(
+    calibrator: Calibrator[Any], answer: Calibration, state: Any, scale: Tensor, widths: Tensor
+) -> Calibration:
+    """Scale the standard deviations of every row by its factor (R,), with its lane width (R,) m."""
     for factor in set(scale.tolist()):
-        answer = select_rows(scale == factor, calibrator.scale_drive(answer, state, factor), answer)
+        scaled = calibrator.scale_drive(answer, state, factor, widths)
+        answer = select_rows(scale == factor, scaled, answer)
     return answer
 
 

@@ -38,8 +38,8 @@ class JointState(NamedTuple):
         doubt: (B,) number of further frames to be fitted alone and compared with the state.
         contrary: (B,) number of consecutive usable frames that contradicted the state.
         contradiction: (B, 4) pose of the last of them less that of the state, until a frame agrees.
-        usual: (B, 2, 4) the pose (rad and m) summed over the frames so far, weighted by time, and the sums of
-            the weights, s (J37).
+        usual: (B, 2, 4) the pose (rad and m) summed over the last frames, weighted by time, and the sums of
+            the weights, s (J37). A frame that tells roll and height well replaces those before.
         turned: (B,) s for which pitch or yaw differed from its mean.
         unusual: (B, 2) rad and m, by which roll and height differ from their means where the frame tells them
             badly, else 0.

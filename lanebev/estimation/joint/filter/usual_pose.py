@@ -1,13 +1,13 @@
 """The roll and height that a drive has shown, against which doubtful ones are compared.
 
-With one lane in view, a lane that becomes narrower looks like a camera that becomes lower. With a wrongly
+With one lane in view, a lane that becomes narrower looks like a camera that becomes higher. With a wrongly
 numbered line in view, the others may fit a wrong roll and height. A camera on a vehicle does not move so.
 """
 
 import torch
 from torch import Tensor
 
-from lanebev.batch import has_flag
+from lanebev.batch import has_flag, select_rows
 from lanebev.estimation.joint.config import JointConfig
 from lanebev.estimation.joint.filter.update import membership
 from lanebev.estimation.joint.layout import NUM_POSE, POSE
@@ -33,7 +33,8 @@ def compare_with_usual(
 ) -> JointState:
     """Compare roll and height with their means so far where the frame tells them badly, and update the means.
 
-    Source: (J37). A camera that was moved has another pitch or yaw too, and begins new means after a while.
+    Source: (J37). A camera that was moved has another pitch or yaw too, and begins new means after a while. A
+    frame that is not tracked changes nothing.
 
     Args:
         before: state before the frame.
@@ -45,14 +46,14 @@ def compare_with_usual(
     """
     tracked = after.status == int(Status.TRACKING)
     roll_unseen = has_flag(after.reasons, Reason.ROLL_UNSEEN)
-    doubtful = tracked & (roll_unseen | has_odd_line(seen, inliers, cfg.num_boundaries))
+    doubtful = roll_unseen | has_odd_line(seen, inliers, cfg.num_boundaries)
     told = tracked.unsqueeze(-1) & ~(
         roll_unseen.unsqueeze(-1) & constant(_IS_ROLL, like=roll_unseen)
     )  # (B, 4)
     pose, (total, time) = after.mean[:, POSE], before.usual.unbind(1)
     free = _FREE * constant(cfg.motion.pose_std, like=pose)
     apart = torch.where(told & (time > _LEAST_TIME), pose - total / time.clamp(min=_LEAST_TIME), 0.0) / free
-    turned = torch.where((apart[:, :ROLL].abs() > 1).any(-1), before.turned + tracked * dt, 0.0)
+    turned = torch.where((apart[:, :ROLL].abs() > 1).any(-1), before.turned + dt, 0.0)
     moved = turned > _TURNED
     beyond = 1 - apart[:, ROLL:].square().amax(-1).clamp(min=1.0).reciprocal()
     doubtful = doubtful & ~moved
@@ -61,7 +62,11 @@ def compare_with_usual(
     fade = torch.where(doubtful, (-dt / _MEMORY).exp(), 0.0)[:, None, None]
     now = _MEMORY * torch.stack([pose, torch.ones_like(pose)], dim=1)
     usual = torch.where(told.unsqueeze(1), torch.lerp(now, before.usual, fade), before.usual)
-    return after._replace(usual=usual, unusual=unusual, turned=torch.where(moved, 0.0, turned))
+    return after._replace(
+        usual=usual,
+        turned=torch.where(tracked, torch.where(moved, 0.0, turned), before.turned),
+        unusual=select_rows(tracked, unusual, before.unusual),
+    )
 
 
 def has_odd_line(seen: Observations, inliers: Tensor, num_boundaries: int) -> Tensor:
