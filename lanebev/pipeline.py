@@ -236,7 +236,6 @@ class LaneBEV(BoundaryDetector):
         begins = None if reset is None else drive_starts(reset, batch, steps)
         check_devices({"image": image, "intrinsics": intrinsics, "distortion": distortion, "reset": begins})
         doubt_intrinsics(intrinsics, (image.shape[-2], image.shape[-1]))
-        intervals = per_frame("dt", dt, batch, steps, intrinsics)
         if state is not None:
             doubt_intervals(intervals)
         if state is None or begins is not None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from numbers import Integral
@@ -26,7 +26,7 @@ from lanebev.geometry.lens import (
     invert_distortion,
 )
 from lanebev.geometry.road import rays_from_pixels
-from lanebev.numbers import check_number
+from lanebev.numbers import check_number, shown
 from lanebev.tensors import device_of_numbers
 from lanebev.types import check_numbers_known, check_tensor
 
@@ -45,6 +45,19 @@ def _check_rows(points: Tensor) -> None:
     check_points(points)
     if points.ndim != 2:
         raise ValueError(f"points: expected (N, 2), got {tuple(points.shape)}; see Tensor.flatten(0, -2)")
+
+
+def _coefficients(given: Any, device: torch.device, dtype: torch.dtype) -> Tensor:
+    """Return coefficients as (D,), where they are (D,), (1, D) or (D, 1)."""
+    try:
+        if isinstance(given, Tensor):
+            numbers = given.detach().to(device, dtype, copy=True)
+        else:
+            values = given.tolist() if isinstance(given, np.ndarray) else list(given)
+            numbers = torch.tensor(values, dtype=dtype, device=device)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise TypeError(f"distortion: expected (D,) numbers, got {shown(given)}") from error
+    return numbers.flatten() if numbers.ndim == 2 and 1 in numbers.shape else numbers
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,7 +114,7 @@ class Camera:
         cy: float,
         width: int,
         height: int,
-        distortion: ArrayLike | Tensor | None = None,
+        distortion: ArrayLike | Tensor | Iterable[float] | None = None,
         model: str = "pinhole",
         dtype: torch.dtype = torch.float64,
     ) -> Camera:
@@ -130,9 +143,7 @@ class Camera:
                 check_number(name, value, "px as a number")
         rows, device = [[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]], device_of_numbers()
         intrinsics = torch.tensor(rows, dtype=dtype, device=device)
-        coefficients = torch.tensor(
-            np.ravel(() if distortion is None else distortion), dtype=dtype, device=device
-        )
+        coefficients = _coefficients(() if distortion is None else distortion, device, dtype)
         return cls(intrinsics, coefficients, model, (height, width))
 
     @classmethod

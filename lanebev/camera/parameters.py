@@ -13,6 +13,7 @@ OFF_CENTRE = 0.2
 """Shares of the sides, more than any data set's principal point is off the centre."""
 
 _SAME_SHAPE = 1.25  # factor between height over width of an image and of a map that covers it, padded
+_UPRIGHT = 1.1  # height over width, from which an image is clearly upright, or lying if width over height
 _LONGEST_SIDE = 99_999  # px
 _LARGEST_XI = 100.0  # ξ of the unified model; 1 is a parabolic mirror, fisheyes have 1 to 4
 
@@ -38,8 +39,12 @@ class CameraParameters(NamedTuple):
 def are_swapped(size: tuple[int, int], like: tuple[int, int]) -> bool:
     """Return whether a size has the proportions of another one only if its sides are swapped."""
     (height, width), (rows, columns) = size, like
-    stated, swapped = (rows * width) / (columns * height), (rows * height) / (columns * width)
-    return not 1 / _SAME_SHAPE < stated < _SAME_SHAPE and 1 / _SAME_SHAPE < swapped < _SAME_SHAPE
+    is_turned = any(
+        upright > _UPRIGHT * beside and across > _UPRIGHT * below
+        for upright, beside, across, below in ((height, width, columns, rows), (width, height, rows, columns))
+    )
+    first, second = rows * height, columns * width
+    return is_turned and max(first, second) < _SAME_SHAPE * min(first, second)
 
 
 def matrix_entries(fx: float, fy: float, cx: float, cy: float) -> list[float]:

@@ -145,12 +145,76 @@ def test_arguments_of_a_cameras_functions_are_checked():
     ):
         cam.scaled((640, 360))
     assert cam.scaled((512, 512)).image_size == (512, 512)
+    for size in ((0, 0), (0, 640), (640, 0), (-1, -1)):
+        with pytest.raises(ValueError, match=r"image_size: expected whole positive \(height, width\)"):
+            cam.scaled(size)
     for function in (cam.rays, cam.distort_points, cam.undistort_points):
         for shape in ((2,), (3, 4, 2)):
             with pytest.raises(ValueError, match=r"points: expected \(.*N, 2\), got"):
                 function(torch.zeros(shape))
     with pytest.raises(TypeError, match="fields: expected a mapping from names to values, got list"):
         Camera.from_fields([1.0])
+
+
+@pytest.mark.parametrize(
+    ("size", "to", "are_swapped"),
+    [
+        ((1024, 1280), (640, 608), False),  # nearly square
+        ((1000, 1100), (1100, 1000), False),
+        ((1024, 1280), (640, 512), True),
+        ((1280, 720), (360, 640), True),
+        ((1280, 720), (640, 360), False),
+    ],
+)
+def test_swapped_sides_of_a_resized_image(size, to, are_swapped):
+    cam = Camera.from_fov(60.0, size[1], size[0])
+    if not are_swapped:
+        assert cam.scaled(to).image_size == to
+        return
+    with pytest.raises(ValueError, match="are they swapped"):
+        cam.scaled(to)
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda values: torch.tensor(values, requires_grad=True),
+        lambda values: [torch.tensor(value, requires_grad=True) for value in values],
+        lambda values: torch.tensor(values, dtype=torch.bfloat16),
+        lambda values: torch.tensor([values], dtype=torch.float16),
+        lambda values: (value for value in values),
+        lambda values: np.array(values, dtype=">f8"),
+        lambda values: np.array(values, dtype=object),
+        lambda values: [[value] for value in values],
+    ],
+)
+def test_coefficients_of_any_kind(make):
+    parameters = (650.0, 655.0, 650.0, 370.0, 1280, 720)
+    values = [-0.25, 0.0625, 0.0, 0.0, 0.0]
+    found = Camera.from_parameters(*parameters, make(values)).distortion
+    assert found.tolist() == values
+    assert not found.requires_grad
+    given = torch.tensor(values, dtype=torch.float64)
+    taken = Camera.from_parameters(*parameters, given).distortion
+    given[0] = 5.0
+    assert taken.tolist() == values
+
+
+@pytest.mark.parametrize(
+    ("given", "error", "words"),
+    [
+        (np.full((2, 4), 0.01), ValueError, r"expected \(D,\), got \(2, 4\)$"),
+        (torch.full((1, 1, 4), 0.01), ValueError, r"expected \(D,\), got \(1, 1, 4\)$"),
+        (0.1, TypeError, r"expected \(D,\) numbers, got 0.1$"),
+        ("0.1 0 0 0", TypeError, r"expected \(D,\) numbers, got '0.1 0 0 0'$"),
+        ([[0.1], [0.1, 0.2]], TypeError, r"expected \(D,\) numbers, got \[\[0.1\], \[0.1, 0.2\]\]$"),
+        ([0.1, None, 0, 0], TypeError, r"expected \(D,\) numbers, got \[0.1, None, 0, 0\]$"),
+        (torch.zeros(4, device="meta"), TypeError, r"expected \(D,\) numbers"),
+    ],
+)
+def test_what_are_no_coefficients(given, error, words):
+    with pytest.raises(error, match=f"^distortion: {words}"):
+        Camera.from_parameters(650.0, 655.0, 650.0, 370.0, 1280, 720, given)
 
 
 @pytest.mark.parametrize("shape", [(5,), (1, 5), (5, 1)])

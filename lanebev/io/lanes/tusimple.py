@@ -117,12 +117,17 @@ def _tusimple_frame(fields: dict[str, Any]) -> FrameLines:
 
 
 def _rows(fields: dict[str, Any]) -> NDArray[np.float64]:
-    """Return the rows (R,) px at which lanes have points; none if they are lists of points."""
+    """Return the rows (R,) px at which lanes have points; none if all are lists of points, or empty."""
     lanes = fields.get("lanes")
-    if isinstance(lanes, list) and any(map(_are_points, lanes)):
-        return np.zeros(0)
     if "h_samples" in fields:
         rows = finite_numbers("h_samples", field(fields, "h_samples", list))
+    elif isinstance(lanes, list) and all(lane == [] or _are_points(lane) for lane in lanes):
+        return np.zeros(0)
+    elif isinstance(lanes, list) and any(map(_are_points, lanes)):
+        raise ValueError(
+            "lanes: expected lists of one kind, got points and numbers; give all lanes as points, "
+            "or all with h_samples"
+        )
     else:
         rows = _benchmark_rows(fields)
     if not (all(a < b for a, b in pairwise(rows)) or all(a > b for a, b in pairwise(rows))):
@@ -151,6 +156,7 @@ def _lane_lines(fields: dict[str, Any], rows: NDArray[np.float64]) -> list[LaneL
         sigma = None if noise is None else _on_rows(f"sigma[{i}]", noise, len(points))
         if sigma is not None and not (sigma[there] > 0).all():
             raise ValueError(f"sigma[{i}]: expected px above 0 where the lane is, got {shown(noise)}")
+        sigma = None if sigma is None else np.where(there, sigma, np.nan)
         if there.any():
             lines.append(LaneLine(points, index, sigma))
     return lines
@@ -207,18 +213,18 @@ def _seen_lines(fields: dict[str, Any]) -> list[LaneLine]:
 def _benchmark_rows(fields: dict[str, Any]) -> list[float]:
     """Return the rows of a prediction without ``h_samples``, by their number, as in TuSimple's benchmark."""
     lanes = field(fields, "lanes", list)
-    count = len(lanes[0]) if lanes and isinstance(lanes[0], list) else 0
+    count = max((len(lane) for lane in lanes if isinstance(lane, list)), default=0)
     for name, values in fields.items():  # y_samples, say
         if count > len(lanes) and name != "lanes" and isinstance(values, list) and len(values) == count:
             raise ValueError(
                 f"h_samples: expected this key, got {shown(name)} with as many numbers; rename it"
             )
-    if lanes and count not in _TUSIMPLE_ROWS:
+    if count not in _TUSIMPLE_ROWS:
         known = " or ".join(map(str, _TUSIMPLE_ROWS))
         raise ValueError(
             f"h_samples: expected a list, got none, and not lanes of TuSimple's {known} rows; add them, in px"
         )
-    return [float(row) for row in _TUSIMPLE_ROWS.get(count, ())]
+    return [float(row) for row in _TUSIMPLE_ROWS[count]]
 
 
 def _on_rows(name: str, values: Any, count: int) -> NDArray[np.float64]:

@@ -50,7 +50,7 @@ def test_lanes_may_be_lists_of_points(tmp_path):
         np.testing.assert_array_equal(frame.lines[0].points, [[5, 110], [6.5, 120], [np.nan, 130]])
         np.testing.assert_array_equal(frame.lines[1].points, [[7, 100], [9, 120]])
         assert [line.boundary for line in frame.lines] == [2, 3]
-        np.testing.assert_array_equal(frame.lines[0].sigma, [1, 2, 1])
+        np.testing.assert_array_equal(frame.lines[0].sigma, [1, 2, np.nan])
     for lane, message in (
         ([[5, 110, 1]], r"lanes\[0\]: expected 2 numbers, got 3"),
         ([[5, 110], 6], r"lanes\[0\]: expected a list, got 6"),
@@ -60,9 +60,31 @@ def test_lanes_may_be_lists_of_points(tmp_path):
             read_lanes(_write(tmp_path / "l.json", json.dumps({"raw_file": "a.jpg", "lanes": [lane]})))
 
 
+def test_a_point_that_is_not_there_has_no_standard_deviation(tmp_path):
+    text = json.dumps(_tusimple(sigma=[[-2, 1, 2], [3, 0, 4]]))
+    (frame,) = read_lanes(_write(tmp_path / "l.json", text))
+    np.testing.assert_array_equal(frame.lines[0].sigma, [np.nan, 1, 2])
+    np.testing.assert_array_equal(frame.lines[1].sigma, [3, np.nan, 4])
+
+
+def test_points_and_numbers_at_rows_together(tmp_path):
+    entry = {"raw_file": "a.jpg", "lanes": [[608, 560], [[608, 300], [560, 330]]]}
+    (frame,) = read_lanes(_write(tmp_path / "l.json", json.dumps({**entry, "h_samples": [300, 330]})))
+    for line in frame.lines:
+        np.testing.assert_array_equal(line.points, [[608, 300], [560, 330]])
+    with pytest.raises(ValueError, match="give all lanes as points, or all with h_samples"):
+        read_lanes(_write(tmp_path / "l.json", json.dumps(entry)))
+
+
+def test_lanes_that_are_all_empty_need_no_rows(tmp_path):
+    for lanes in ([[], []], []):
+        text = json.dumps({"raw_file": "a.jpg", "lanes": lanes})
+        assert read_lanes(_write(tmp_path / "l.json", text))[0].lines == []
+
+
 @pytest.mark.parametrize(("count", "first"), [(56, 160), (48, 240)])
 def test_predictions_for_tusimples_benchmark_leave_the_rows_out(tmp_path, count, first):
-    lines = [{"raw_file": "a", "lanes": [[5.0] * count], "run_time": 10}, {"raw_file": "b", "lanes": []}]
+    lines = [{"raw_file": "a", "lanes": [[], [5.0] * count], "run_time": 10}, {"raw_file": "b", "lanes": []}]
     frames = read_tusimple(_write(tmp_path / "pred.json", "\n".join(map(json.dumps, lines))))
     np.testing.assert_array_equal(frames[0].lines[0].points[:, 1], np.arange(first, 711, 10))
     assert frames[1].lines == []
