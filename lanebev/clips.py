@@ -53,15 +53,23 @@ def per_frame(name: str, value: float | Tensor, batch: int, steps: int, like: Te
     return numbers.expand(batch, steps)
 
 
-def doubt_intervals(intervals: Tensor) -> None:
+def doubt_intervals(intervals: Tensor, begins: Tensor | None) -> None:
     """Warn if all time steps (B, T) s after frames of a drive are longer than those of a camera.
 
-    Where reading numbers would wait for a device, there is no warning.
+    Where reading numbers would wait for a device, there is no warning. Its text is always the same: Python
+    then shows it once.
+
+    Args:
+        intervals: (B, T) s.
+        begins: (B, T) bool, the frames that begin a drive, whose time steps do not count; None for none.
     """
-    if readable(intervals) and intervals.numel() and bool((intervals > _LONG_DT).all()):
+    if not (readable(intervals) and (begins is None or readable(begins))):
+        return
+    counted = intervals[intervals.isfinite() if begins is None else intervals.isfinite() & ~begins]
+    if counted.numel() and bool((counted > _LONG_DT).all()):
         warnings.warn(
-            f"dt: expected seconds since the frame before, got {float(intervals.min()):g} or more in all "
-            "frames; of milliseconds give dt / 1000",
+            f"dt: expected seconds since the frame before, got more than {_LONG_DT:g} in all frames; of "
+            "milliseconds give dt / 1000",
             stacklevel=3,
         )
 

@@ -237,7 +237,7 @@ class LaneBEV(BoundaryDetector):
         check_devices({"image": image, "intrinsics": intrinsics, "distortion": distortion, "reset": begins})
         doubt_intrinsics(intrinsics, (image.shape[-2], image.shape[-1]))
         if state is not None:
-            doubt_intervals(intervals)
+            doubt_intervals(intervals, begins)
         if state is None or begins is not None:
             dtype = common_dtype(intrinsics) if state is None else state[0].dtype
             fresh = self.initial_state(batch, dtype, image.device)

@@ -11,7 +11,10 @@ from lanebev.numbers import check_number
 logger = logging.getLogger(__name__)
 
 FIRST_DT = 1 / 30  # s before a first frame: it has no frame before
-_SHORT_DT, _LONG_DT = 2e-3, 5.0  # s; if all steps are shorter or longer, the stamps are probably not seconds
+_SHORT_DT, _LONG_DT = (
+    1e-3 / 1.5,
+    5.0,
+)  # s; if all steps are shorter or longer, the stamps are probably not seconds
 _LOOKED_AT = 5  # number of steps that are checked for that
 
 

@@ -349,13 +349,35 @@ def test_images_with_swapped_sides_are_doubted(model):
 def test_milliseconds_are_doubted(model, dt):
     _, state = model(IMAGE, SMALL_K)
     with pytest.warns(
-        UserWarning, match="dt: expected seconds .*, got 33 or more in all frames; of milliseco"
+        UserWarning, match="dt: expected seconds .*, got more than 5 in all frames; of milliseco"
     ):
         model(IMAGE, SMALL_K, state, dt)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         model(IMAGE, SMALL_K, state, torch.tensor(1.0))
         model(IMAGE.expand(2, -1, -1, -1), SMALL_K.expand(2, -1, -1), dt=dt)  # of a first frame
+
+
+def test_intervals_are_doubted_once(model):
+    _, state = model(IMAGE, SMALL_K)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("default")
+        for dt in (30.0, 31.0, 32.5):
+            model(IMAGE, SMALL_K, state, dt)
+    assert len([each for each in caught if "dt: " in str(each.message)]) == 1
+
+
+def test_intervals_that_do_not_count_are_not_doubted(model):
+    _, state = model(IMAGE, SMALL_K)
+    clip = IMAGE[:, None].expand(-1, 2, -1, -1, -1)
+    reset = torch.tensor([[True, False]])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        model(IMAGE, SMALL_K, state, math.inf)
+        model(IMAGE, SMALL_K, state, 33.0, reset=torch.tensor([True]))
+        model(clip, SMALL_K, state, torch.tensor([[33.0, 0.1]]), reset=reset)
+    with pytest.warns(UserWarning, match="dt: expected seconds"):
+        model(clip, SMALL_K, state, torch.tensor([[0.1, 33.0]]), reset=reset)
 
 
 def test_a_speed_that_does_not_fit(model):

@@ -95,6 +95,13 @@ def test_other_units_of_time_are_noticed(caplog, step, units):
     assert len(caplog.records) == 1  # not in every frame
 
 
+def test_a_camera_of_1000_frames_a_second_is_not_doubted(caplog):
+    session = Session(CAMERA)
+    said = [session(polylines=lines(), stamp=1e-3 * k).reasons for k in range(8)]
+    assert not any("expected seconds" in text for texts in said for text in texts)
+    assert not caplog.records
+
+
 @pytest.mark.parametrize(
     ("change", "words"),
     [

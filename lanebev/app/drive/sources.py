@@ -31,7 +31,7 @@ from lanebev.signals import handlers_kept
 
 _RECTIFIED = re.compile(r"(?:^|[/_])rect(?:ified)?(?:[/_]|$)")  # in topics of ROS's image_proc, which P is of
 _MOST_WITHOUT = 0.5  # fraction of the frames, that may be without speed
-_SHORT_STEP, _LONG_STEP = Fraction(1, 500), 5  # s between frames of a drive
+_SHORT_STEP, _LONG_STEP = Fraction(1, 1500), 5  # s between frames of a drive
 
 
 def make_source(config: RunConfig, may_take_none: bool = False) -> FrameSource:
@@ -75,7 +75,9 @@ def _remarks_on_drive(config: RunConfig, found: FrameSource) -> Iterator[str]:
     """Yield remarks, some of them empty, on the times of frames and on images of several drives."""
     step = config.every / found.fps
     if found.count > 1 and not _SHORT_STEP <= step <= _LONG_STEP:
-        remedy = "if so, use --stills" if step > 1 else "if not, give its frames as images, and --fps"
+        remedy = "give --fps" if found.paths else "give its frames as images, and --fps"
+        remedy = "correct --fps" if found.fps == config.frame_rate else remedy
+        remedy = "if so, use --stills" if step > 1 else f"if not, {remedy}"
         yield f"its frames are {float(step):.3g} s apart; is the frame rate right? {remedy}"
     if not found.paths:
         return
@@ -159,7 +161,8 @@ def camera_of(config: RunConfig, source: FrameSource) -> Camera:
         )
     try:
         rectified = config.rectified or bool(_RECTIFIED.search(source.topic))
-        return replace(Camera.from_fields(source.lens, rectified), remark=source.lens_remark)
+        camera = Camera.from_fields(source.lens, rectified)
+        return replace(camera, remark="; ".join(filter(None, (camera.remark, source.lens_remark))))
     except ValueError as error:
         raise ValueError(f"camera of bag {source.source}: {error}; give --camera FILE") from error
 

@@ -21,6 +21,7 @@ from lanebev.io.frames import ALL, Frame
 from lanebev.io.images.pixels import dark_remark
 from lanebev.io.rising_clock import RisingClock
 from lanebev.io.side_by_side import halves_remark
+from lanebev.numbers import shown
 
 _LOOKED_AT = 50  # frames for their rate, and messages for the lens
 _LONGEST_GROUP = 600  # frames, which a video in a bag may begin before its first key frame
@@ -152,14 +153,20 @@ def _lenses_remark(lenses: Sequence[Mapping[str, Any]]) -> str:
     other = next((each for each in lenses if each != lenses[0]), None)
     if other is None:
         return ""
-    before, after = (
-        f"{each['K'][0]:g} px for {each.get('width')} x {each.get('height')} px"
-        for each in (lenses[0], other)
-    )
     return (
-        f"CameraInfo changes, its focal length from {before} to {after}; the first is taken for all images: "
+        f"CameraInfo changes, {_first_difference(lenses[0], other)}; the first is taken for all images: "
         "fix focus and resolution, or give --camera FILE"
     )
+
+
+def _first_difference(before: Mapping[str, Any], after: Mapping[str, Any]) -> str:
+    """Return the first field of two lenses that differs, of a list its first such number, and both values."""
+    name = next(each for each in {**before, **after} if before.get(each) != after.get(each))
+    old, new = before.get(name), after.get(name)
+    if isinstance(old, list) and isinstance(new, list) and len(old) == len(new):
+        place = next(i for i, (a, b) in enumerate(zip(old, new, strict=True)) if a != b)
+        name, old, new = f"{name}[{place}]", old[place], new[place]
+    return f"{name} from {shown(old)} to {shown(new)}"
 
 
 def _lenses(bag: Bag, images: str) -> list[dict[str, Any]]:

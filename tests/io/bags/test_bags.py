@@ -182,7 +182,7 @@ def _ros1_bag(path):
         ((0, 0, 60, 60), ""),
         (
             (60, 60, 63),
-            "CameraInfo changes, its focal length from 60 px for 64 x 48 px to 63 px for 64 x 48 px;",
+            "CameraInfo changes, K[0] from 60.0 to 63.0; the first is taken",
         ),
         ((0, 0), None),
     ],
@@ -209,6 +209,47 @@ def test_a_lens_that_is_set_up_late_or_moves(tmp_path, focals, words):
     assert camera.intrinsics[0, 0] == 60
     assert camera.remark.startswith(words)
     assert bool(camera.remark) == bool(words)
+
+
+@pytest.mark.parametrize(
+    ("field", "place", "words"),
+    [
+        ("d", 1, "D[1]"),
+        ("p", 2, "P[2]"),
+        ("width", None, "width"),
+        ("distortion_model", None, "distortion_m"),
+    ],
+)
+def test_the_field_of_a_lens_that_changes_is_named(tmp_path, field, place, words):
+    name = "sensor_msgs/msg/CameraInfo"
+    first, other = _info(), _info()
+    if place is None:
+        setattr(other, field, {"width": 65, "distortion_model": "rational"}[field])
+    else:
+        value = getattr(other, field).copy()
+        value[place] += 0.5
+        setattr(other, field, value)
+    folder = tmp_path / "bag"
+    with Writer(folder, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        info = writer.add_connection("/cam/camera_info", name, typestore=STORE)
+        images = writer.add_connection("/cam/image", "sensor_msgs/msg/CompressedImage", typestore=STORE)
+        for number, message in enumerate((first, first, other)):
+            writer.write(info, round(1e9 * (START + number)), STORE.serialize_cdr(message, name))
+        picture = STORE.serialize_cdr(_compressed(0), "sensor_msgs/msg/CompressedImage")
+        writer.write(images, round(1e9 * START), picture)
+    source = make_source(RunConfig(str(folder), ""))
+    assert source.lens_remark.startswith(f"CameraInfo changes, {words}"), source.lens_remark
+
+
+@pytest.mark.parametrize("doubt", ["", "CameraInfo changes"])
+def test_remarks_on_a_lens_are_joined(bags, doubt):
+    config = RunConfig(str(bags["mcap"]), "")
+    source = make_source(config)
+    lens = {**source.lens, "distortion_model": "", "D": [-0.1, 0.01, 0.02, 0.005]}
+    remark = camera_of(config, replace(source, lens=lens, lens_remark=doubt)).remark
+    own = Camera.from_fields(lens).remark
+    assert own.startswith("it states four coefficients and no lens model")
+    assert remark == (f"{own}; {doubt}" if doubt else own)
 
 
 def test_other_topics_that_last_longer_change_no_frame_rate(tmp_path):

@@ -33,10 +33,11 @@ def test_links_that_lead_nowhere_are_lost_frames(tmp_path):
         ({"fps": 1 / 30}, "30 s apart; is the frame rate right? if so, use --stills"),
         ({"fps": 0.5}, ""),
         ({"fps": 240.0}, ""),
+        ({"fps": 1000.0}, ""),
         ({"fps": 1 / 30, "stills": True}, ""),
         (
             {"fps": 1e4},
-            "0.0001 s apart; is the frame rate right? if not, give its frames as images, and --fps",
+            "0.0001 s apart; is the frame rate right? if not, correct --fps",
         ),
     ],
 )
