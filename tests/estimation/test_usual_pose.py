@@ -3,13 +3,15 @@
 import math
 from dataclasses import replace
 
+import pytest
 import torch
 
 from lanebev.estimation.joint.calibrator import JointCalibrator
 from lanebev.estimation.joint.filter.usual_pose import has_odd_line
 from lanebev.estimation.joint.measurement.observations import observations
 from lanebev.estimation.joint.measurement.residuals import HEIGHT
-from lanebev.testing.moments import CAMERA, moments, observe
+from lanebev.tensors import map_tensors
+from lanebev.testing.moments import CAMERA, FPS, WIDTH, moments, observe
 from lanebev.testing.motions import sinusoids
 from tests.estimation.joint_drives import DOUBLE
 from tools.bench_kinds import drawn
@@ -37,6 +39,31 @@ def test_a_lane_that_becomes_narrower_leaves_the_height_in_doubt():
     assert error[narrower].abs().min() > 0.2
     assert (error.abs() < 3 * std)[narrower].all()
     assert std[3 * SECOND] < 0.06  # before
+
+
+@pytest.mark.parametrize("frame", [3 * SECOND, 6 * SECOND])
+def test_forward_derivatives_of_the_covariance_are_differences(frame):
+    """Before and after the lane becomes narrower."""
+    [drive] = drawn(NARROWING, [60_004])
+    calibrator = JointCalibrator()
+    state = calibrator.initial_state(1, dtype=DOUBLE)
+
+    def variance(seen, state):
+        out, after = calibrator(seen, CAMERA[None], state, 1 / FPS, WIDTH)
+        return out.covariance[0, HEIGHT, HEIGHT], after
+
+    for k in range(frame):
+        _, state = variance(map_tensors(lambda part, k=k: part[k : k + 1], drive.segments), state)
+    seen = map_tensors(lambda part: part[frame : frame + 1], drive.segments)
+    ends = seen.endpoints.double()
+    along = torch.randn(ends.shape, generator=torch.Generator().manual_seed(0), dtype=DOUBLE)
+
+    def moved(by):
+        return variance(seen._replace(endpoints=ends + by * along), state)[0]
+
+    one = torch.ones((), dtype=DOUBLE)
+    _, derivative = torch.func.jvp(moved, (0 * one,), (one,))
+    torch.testing.assert_close(derivative, (moved(1e-5) - moved(-1e-5)) / 2e-5, rtol=1e-2, atol=1e-12)
 
 
 def test_a_camera_that_swings_is_not_in_doubt():

@@ -47,17 +47,18 @@ def compare_with_usual(
     tracked = after.status == int(Status.TRACKING)
     roll_unseen = has_flag(after.reasons, Reason.ROLL_UNSEEN)
     doubtful = roll_unseen | has_odd_line(seen, inliers, cfg.num_boundaries)
-    told = tracked.unsqueeze(-1) & ~(
-        roll_unseen.unsqueeze(-1) & constant(_IS_ROLL, like=roll_unseen)
-    )  # (B, 4)
+    unseen = roll_unseen.unsqueeze(-1) & constant(_IS_ROLL, like=roll_unseen)
+    told = tracked.unsqueeze(-1) & ~unseen  # (B, 4)
     pose, (total, time) = after.mean[:, POSE], before.usual.unbind(1)
     free = _FREE * constant(cfg.motion.pose_std, like=pose)
     apart = torch.where(told & (time > _LEAST_TIME), pose - total / time.clamp(min=_LEAST_TIME), 0.0) / free
     turned = torch.where((apart[:, :ROLL].abs() > 1).any(-1), before.turned + dt, 0.0)
     moved = turned > _TURNED
-    beyond = 1 - apart[:, ROLL:].square().amax(-1).clamp(min=1.0).reciprocal()
     doubtful = doubtful & ~moved
-    unusual = (doubtful * beyond.sqrt()).unsqueeze(-1) * (free * apart)[:, ROLL:]
+    farthest = apart[:, ROLL:].square().amax(-1)
+    far = doubtful & (farthest > 1)
+    beyond = (1 - torch.where(far, farthest, 2.0).reciprocal()).sqrt()  # 2: the slope at 1 is infinite
+    unusual = torch.where(far, beyond, 0.0).unsqueeze(-1) * (free * apart)[:, ROLL:]
 
     fade = torch.where(doubtful, (-dt / _MEMORY).exp(), 0.0)[:, None, None]
     now = _MEMORY * torch.stack([pose, torch.ones_like(pose)], dim=1)
