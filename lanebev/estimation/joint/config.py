@@ -64,7 +64,7 @@ class MotionConfig:
 
     @property
     def pose_std(self) -> tuple[float, float, float, float]:
-        """Standard deviations of pitch, yaw, roll and height about their slow means."""
+        """Standard deviations of pitch, yaw, roll (rad) and height (m) about their slow means."""
         return self.angle_std, self.angle_std, self.angle_std, self.height_std
 
 
